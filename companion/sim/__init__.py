@@ -1,0 +1,1 @@
+"""A simulated room, robot and sensors that speak the real protocols."""

@@ -1,0 +1,1 @@
+"""Estimation mathematics: no I/O, no clock, nothing of ours but the measurement types."""

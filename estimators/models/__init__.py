@@ -1,0 +1,1 @@
+"""Measurement and motion models: value, Jacobian, covariance; shared by every estimator."""
