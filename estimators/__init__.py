@@ -1,1 +1,40 @@
 """Estimation mathematics: no I/O, no clock, nothing of ours but the measurement types."""
+
+from importlib import import_module
+from typing import Any, cast
+
+from pydantic import BaseModel
+
+from estimators.base import Estimator, Setup
+
+ESTIMATORS: dict[str, tuple[str, str]] = {
+    "ekf": ("estimators.ekf", "Ekf"),
+    "least_squares": ("estimators.least_squares", "LeastSquares"),
+    "lidar_odometry": ("estimators.lidar.odometry", "LidarOdometry"),
+}
+"""Name on the command line -> module and class. The class has a nested pydantic `Config`."""
+
+
+def _estimator_class(name: str) -> Any:
+    module, class_name = ESTIMATORS[name]
+    return getattr(import_module(module), class_name)
+
+
+def estimator_config_class(name: str) -> type[BaseModel]:
+    """Config class of the named estimator.
+
+    Raises:
+        KeyError: no estimator has that name.
+    """
+    return cast("type[BaseModel]", _estimator_class(name).Config)
+
+
+def make_estimator(name: str, config: BaseModel, setup: Setup) -> Estimator:
+    """New estimator of the given name.
+
+    Args:
+        name: a key of `ESTIMATORS`.
+        config: instance of its `Config`.
+        setup: geometry of the site.
+    """
+    return cast("Estimator", _estimator_class(name)(config, setup))

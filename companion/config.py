@@ -1,0 +1,342 @@
+"""Everything that can be set: site file, defaults and `--set`, checked before any port opens."""
+
+import tomllib
+from collections.abc import Sequence
+from functools import cache
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+import numpy as np
+import tomli_w
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model, field_validator
+
+from companion.errors import UserError
+from drivers import SENSORS, sensor_config_class
+from drivers.errors import PortError
+from drivers.port import parse_address
+from estimators import ESTIMATORS, estimator_config_class
+from estimators.base import Setup, Start
+from estimators.lidar.scan_matching import ScanMatcher
+from estimators.messages import FloatArray
+from estimators.trilateration import AnchorGeometryError, check_anchor_geometry
+
+M = TypeVar("M", bound=BaseModel)
+Coordinate = Annotated[float, Field(ge=-10_000, le=10_000, allow_inf_nan=False)]
+
+
+class Table(BaseModel):
+    """A table of a TOML file: unknown keys are errors."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class SiteTable(Table):
+    """The place."""
+
+    name: str = Field("unnamed", description="shown in titles and summaries")
+    map_heading_deg: float = Field(
+        0.0, ge=-360, le=360, description="compass heading of the map's +x axis, clockwise from north [deg]"
+    )
+    walls: list[list[tuple[Coordinate, Coordinate]]] = Field(
+        [], description="polylines of walls, drawn in views only [m]"
+    )
+
+
+class BodyTable(Table):
+    """The robot: where its sensors sit. Body frame: x forward, y left, z up."""
+
+    height: Coordinate = Field(0.0, description="body origin above the map's z = 0 [m]")
+    height_sigma: float = Field(0.05, gt=0, le=10, description="standard deviation of the height [m]")
+    level_sigma_deg: float = Field(3.0, gt=0, le=90, description="standard deviation of roll and pitch [deg]")
+    tag: tuple[Coordinate, Coordinate, Coordinate] = Field(
+        (0.0, 0.0, 0.0), description="UWB tag antenna in the body frame [m]"
+    )
+    lidar: tuple[Coordinate, Coordinate] = Field(
+        (0.0, 0.0), description="LiDAR's rotation centre in the body frame [m]"
+    )
+    lidar_yaw_deg: float = Field(
+        0.0, ge=-360, le=360, description="LiDAR's 0 deg beam, counter-clockwise from body x [deg]"
+    )
+
+
+class StartTable(Table):
+    """Where the robot stands when the process starts, and how well that is known."""
+
+    x: Coordinate
+    y: Coordinate
+    yaw_deg: float = Field(ge=-360, le=360)
+    sigma_xy: float = Field(0.10, gt=0, le=100, description="[m], each axis")
+    sigma_yaw_deg: float = Field(5.0, gt=0, le=180)
+
+
+class SensorTable(Table):
+    """A sensor on a port."""
+
+    driver: str = Field(description="one of " + ", ".join(SENSORS))
+    port: str = Field(
+        description="serial device (/dev/ttyUSB0?baud=921600) or any pyserial URL (socket://host:port)"
+    )
+    settings: Any = Field(
+        default_factory=dict, validate_default=True, description="the driver's own settings"
+    )
+
+    @field_validator("driver")
+    @classmethod
+    def _known_driver(cls, driver: str) -> str:
+        return _known(driver, SENSORS, "driver")
+
+    @field_validator("port")
+    @classmethod
+    def _readable_port(cls, port: str) -> str:
+        try:
+            parse_address(port)
+        except PortError as error:
+            raise ValueError(str(error)) from error
+        return port
+
+    @field_validator("settings")
+    @classmethod
+    def _driver_settings(cls, settings: Any, info: Any) -> Any:
+        if "driver" not in info.data:
+            return settings
+        return sensor_config_class(info.data["driver"]).model_validate(settings)
+
+
+class PipelineTable(Table):
+    """How measurements are ordered and poses given out."""
+
+    estimator: str = Field("ekf", description="whose pose goes to the autopilot")
+    rate: float = Field(30.0, ge=4, le=50, description="poses a second [Hz]")
+    hold_ms: float = Field(
+        30.0, ge=0, le=1000, description="wait this long for slower sensors, to keep stamp order [ms]"
+    )
+
+    @field_validator("estimator")
+    @classmethod
+    def _known_estimator(cls, name: str) -> str:
+        return _known(name, ESTIMATORS, "estimator")
+
+
+class HealthTable(Table):
+    """When the pose is good enough to send."""
+
+    max_sigma_xy: float = Field(
+        0.5, gt=0, le=100, description="position sigma above which no pose is sent [m]"
+    )
+    max_sigma_yaw_deg: float = Field(20.0, gt=0, le=180, description="the same for heading [deg]")
+    max_range_age: float = Field(
+        1.0, gt=0, le=60, description="degraded when no range was accepted for so long [s]"
+    )
+    max_increment_age: float = Field(
+        1.0, gt=0, le=60, description="degraded when no LiDAR increment was accepted for so long [s]"
+    )
+    min_accepted_share: float = Field(
+        0.25, ge=0, le=1, description="lost when a smaller share of recent ranges agrees with the pose"
+    )
+
+
+class MavlinkTable(Table):
+    """The link to the autopilot."""
+
+    url: str = Field("udpout:127.0.0.1:14550", description="pymavlink device string, or empty for none")
+    baud: int = Field(921600, ge=1200, le=4_000_000, description="baud of a serial link")
+    system_id: int = Field(
+        1, ge=1, le=255, description="system id until the autopilot's own HEARTBEAT is heard"
+    )
+    component_id: int = Field(197, ge=1, le=255, description="197 is MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY")
+
+
+class Config(Table):
+    """A whole configuration, as a run uses it."""
+
+    site: SiteTable = Field(default_factory=SiteTable)
+    anchors: dict[int, tuple[Coordinate, Coordinate, Coordinate]]
+    body: BodyTable = Field(default_factory=BodyTable)
+    start: StartTable
+    sensor: dict[str, SensorTable] = Field(min_length=1)
+    pipeline: PipelineTable = Field(default_factory=PipelineTable)
+    scan_matcher: ScanMatcher.Config = Field(default_factory=ScanMatcher.Config)
+    estimator: Any = Field(
+        default_factory=dict, validate_default=True, description="a table for each estimator, by name"
+    )
+    health: HealthTable = Field(default_factory=HealthTable)
+    mavlink: MavlinkTable = Field(default_factory=MavlinkTable)
+
+    @field_validator("anchors")
+    @classmethod
+    def _usable_anchors(cls, anchors: dict[int, tuple[float, float, float]]) -> Any:
+        try:
+            check_anchor_geometry(np.array(list(anchors.values())).reshape(-1, 3))
+        except AnchorGeometryError as error:
+            raise ValueError(str(error)) from error
+        return anchors
+
+    @field_validator("estimator")
+    @classmethod
+    def _estimator_settings(cls, settings: Any) -> Any:
+        return _estimator_tables().model_validate(settings)
+
+    def estimator_config(self, name: str) -> BaseModel:
+        """Settings of the named estimator."""
+        config = getattr(self.estimator, name)
+        assert isinstance(config, BaseModel)
+        return config
+
+    def setup(self) -> Setup:
+        """Geometry in the form the estimators take it: metres and radians."""
+        start, body = self.start, self.body
+        yaw_sigma = np.deg2rad(start.sigma_yaw_deg)
+        return Setup(
+            anchors={i: np.array(position) for i, position in self.anchors.items()},
+            tag_in_body=np.array(body.tag),
+            start=Start(
+                pose=np.array([start.x, start.y, np.deg2rad(start.yaw_deg)]),
+                sigma=np.array([start.sigma_xy, start.sigma_xy, yaw_sigma]),
+            ),
+            height=body.height,
+            height_sigma=body.height_sigma,
+            level_sigma=float(np.deg2rad(body.level_sigma_deg)),
+        )
+
+    def lidar_mounting(self) -> FloatArray:
+        """`T_body_lidar`, (3,): x [m], y [m], yaw [rad] in the body frame."""
+        return np.array([*self.body.lidar, np.deg2rad(self.body.lidar_yaw_deg)])
+
+    def map_heading(self) -> float:
+        """Compass heading of the map's x axis [rad], clockwise from north."""
+        return float(np.deg2rad(self.site.map_heading_deg))
+
+    def to_toml(self) -> str:
+        """The configuration as TOML, every key with its value."""
+        return tomli_w.dumps(_toml_ready(self.model_dump(mode="json", serialize_as_any=True)))
+
+
+def load_config(site: Path, sets: Sequence[str] = ()) -> Config:
+    """Read a site file over the defaults, then apply `--set` assignments.
+
+    Raises:
+        UserError: file missing or not TOML, unknown key, bad value: named with the limit it breaks.
+    """
+    return config_from_toml(read_text(site), str(site), sets)
+
+
+def config_from_toml(text: str, origin: str, sets: Sequence[str] = ()) -> Config:
+    """Check a configuration text; `origin` names it in errors.
+
+    Raises:
+        UserError: as `load_config`.
+    """
+    data = parse_toml(text, origin)
+    for assignment in sets:
+        apply_set(data, assignment)
+    return validated(Config, data, origin)
+
+
+def default_toml() -> str:
+    """Every key that has a default, with it; what a site file must give itself is named in comments."""
+    anchors = {0: (0.0, 0.0, 2.0), 1: (0.0, 5.0, 2.0), 2: (5.0, 0.0, 2.0)}
+    start = {"x": 0, "y": 0, "yaw_deg": 0}
+    sensors = {driver: {"driver": driver, "port": "/dev/ttyUSB0"} for driver in SENSORS}
+    full = Config.model_validate({"anchors": anchors, "start": start, "sensor": sensors})
+    data = full.model_dump(mode="json", serialize_as_any=True)
+    del data["anchors"], data["sensor"]
+    data["start"] = {k: v for k, v in data["start"].items() if k.startswith("sigma")}
+    return tomli_w.dumps(_toml_ready(data))
+
+
+def read_text(path: Path) -> str:
+    """Text of a file the user named.
+
+    Raises:
+        UserError: it cannot be read, or is not text.
+    """
+    try:
+        return path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise UserError(f"cannot read {path}: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise UserError(f"{path} is not a text file: {error.reason} at byte {error.start}") from error
+
+
+def parse_toml(text: str, origin: str) -> dict[str, Any]:
+    """TOML to a dictionary.
+
+    Raises:
+        UserError: not TOML, with the place of the mistake.
+    """
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise UserError(f"{origin} is not valid TOML: {error}") from error
+
+
+def apply_set(data: dict[str, Any], assignment: str) -> None:
+    """Apply one `--set a.b=value`; the value is read as TOML, or as text when it is none.
+
+    Raises:
+        UserError: no `=`, or the path goes through a value that is not a table.
+    """
+    path, equals, text = assignment.partition("=")
+    if not equals or not path.strip():
+        raise UserError(f"--set {assignment!r}: write key=value, for example pipeline.rate=20")
+    try:
+        value: Any = tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        value = text
+    *tables, key = path.strip().split(".")
+    for name in tables:
+        data = data.setdefault(name, {})
+        if not isinstance(data, dict):
+            raise UserError(f"--set {assignment!r}: {name!r} is a value, not a table")
+    data[key] = value
+
+
+def validated(model: type[M], data: dict[str, Any], origin: str) -> M:
+    """Check data against a model.
+
+    Raises:
+        UserError: the first thing that is wrong, with key, value and limit.
+    """
+    try:
+        return model.model_validate(data)
+    except ValidationError as error:
+        first, *others = error.errors()
+        key = ".".join(str(part) for part in first["loc"])
+        reason = first["msg"].removeprefix("Value error, ")
+        if first["type"] == "extra_forbidden":
+            reason = "unknown key"
+        elif first["type"] == "missing":
+            reason = "this key is required and missing"
+        elif not isinstance(first["input"], dict):
+            reason += f", got {first['input']!r}"
+        more = f" (and {len(others)} more)" if others else ""
+        raise UserError(f"{origin}: {key}: {reason}{more}") from error
+
+
+def params_dir() -> Path:
+    """Folder of the files that ship with the project: `params/` of a checkout, or its copy in a wheel."""
+    here = Path(__file__).parent
+    return next(p for p in (here / "_params", here.parent / "params") if p.is_dir())
+
+
+@cache
+def _estimator_tables() -> type[Table]:
+    """A table with one key an estimator, each with the estimator's own keys."""
+    configs = {name: estimator_config_class(name) for name in ESTIMATORS}
+    fields: Any = {name: (config, Field(default_factory=config)) for name, config in configs.items()}
+    return create_model("EstimatorTables", __base__=Table, **fields)
+
+
+def _known(name: str, table: dict[str, Any], what: str) -> str:
+    if name not in table:
+        raise ValueError(f"unknown {what} {name!r}, there are: {', '.join(table)}")
+    return name
+
+
+def _toml_ready(value: Any) -> Any:
+    """JSON-like data without what TOML lacks (None, integer keys)."""
+    if isinstance(value, dict):
+        return {str(k): _toml_ready(v) for k, v in value.items() if v is not None}
+    if isinstance(value, list | tuple):
+        return [_toml_ready(v) for v in value]
+    return value

@@ -1,0 +1,136 @@
+"""Whether the pose is good enough to fly on: what the autopilot must never receive is decided here."""
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+
+from companion.config import HealthTable
+from estimators.base import Report, Verdict
+from estimators.messages import Measurement, PoseEstimate, PoseIncrement, RangeFrame, measurement_stamp_ns
+
+MEMORY = 2.0
+"""Time constant [s] over which the share of accepted ranges is remembered."""
+
+
+class State(StrEnum):
+    """How far the pose can be trusted."""
+
+    STARTING = "starting"
+    """No pose yet."""
+    OK = "ok"
+    DEGRADED = "degraded"
+    """A sensor is missing; the pose is still sent, with the covariance that it then has."""
+    LOST = "lost"
+    """Not sent."""
+
+
+@dataclass(frozen=True, slots=True)
+class Health:
+    """Judgement at one instant.
+
+    Attributes:
+        state: see `State`.
+        reason: one line for the operator; empty when all is well.
+    """
+
+    state: State
+    reason: str
+
+    @property
+    def sends(self) -> bool:
+        """True when the pose may go to the autopilot."""
+        return self.state in (State.OK, State.DEGRADED)
+
+
+@dataclass(frozen=True, slots=True)
+class _Source:
+    """How long ago one kind of measurement was last accepted."""
+
+    what: str
+    age: float
+    is_stale: bool
+    first_awaited: bool
+
+
+class HealthMonitor:
+    """Follows the verdicts on the pose that is sent.
+
+    Args:
+        table: limits.
+        has_ranges: the site has a UWB sensor.
+        has_scans: the site has a LiDAR.
+    """
+
+    def __init__(self, table: HealthTable, has_ranges: bool, has_scans: bool) -> None:
+        self._table = table
+        self._has_ranges = has_ranges
+        self._has_scans = has_scans
+        self._accepted_share = 1.0
+        self._share_stamp_ns: int | None = None
+        self._range_ns: int | None = None
+        self._increment_ns: int | None = None
+        self._begin_ns: int | None = None
+
+    def observe(self, measurement: Measurement, report: Report) -> None:
+        """Take note of what the estimator made of a measurement."""
+        stamp_ns = measurement_stamp_ns(measurement)
+        if self._begin_ns is None:
+            self._begin_ns = stamp_ns
+        good = sum(verdict is Verdict.ACCEPTED for verdict in report.verdicts)
+        if isinstance(measurement, PoseIncrement):
+            if good and measurement.from_stamp_ns < measurement.stamp_ns:
+                self._increment_ns = stamp_ns
+            return
+        judged = good + sum(verdict is Verdict.GATED for verdict in report.verdicts)
+        if not isinstance(measurement, RangeFrame) or not judged:
+            return
+        if good:
+            self._range_ns = stamp_ns
+        dt = 0.0 if self._share_stamp_ns is None else (stamp_ns - self._share_stamp_ns) * 1e-9
+        keep = np.exp(-dt / MEMORY)
+        self._accepted_share = float(keep * self._accepted_share + (1.0 - keep) * good / judged)
+        self._share_stamp_ns = stamp_ns
+
+    def judge(self, pose: PoseEstimate | None, now_ns: int) -> Health:
+        """State at `now_ns` for the pose that would be sent."""
+        table = self._table
+        if pose is None:
+            return Health(State.STARTING, "no pose yet: waiting for measurements")
+        sources = self._sources(now_ns)
+        awaited = [s.what for s in sources if s.first_awaited and not s.is_stale]
+        if awaited:
+            return Health(State.STARTING, f"waiting for the first {awaited[0]}")
+        if not (np.isfinite(pose.T_map_body).all() and np.isfinite(pose.cov).all()):
+            return Health(State.LOST, "pose or covariance is not finite")
+        eigenvalues = np.linalg.eigvalsh(pose.cov)
+        if eigenvalues[0] <= 0.0:
+            return Health(State.LOST, "covariance is not positive definite")
+        sigma_xy = float(np.sqrt(np.linalg.eigvalsh(pose.cov[:2, :2])[1]))
+        if sigma_xy > table.max_sigma_xy:
+            return Health(State.LOST, f"position sigma {sigma_xy:.2f} m above {table.max_sigma_xy:g} m")
+        sigma_yaw = float(np.rad2deg(np.sqrt(pose.cov[5, 5])))
+        if sigma_yaw > table.max_sigma_yaw_deg:
+            return Health(
+                State.LOST, f"heading sigma {sigma_yaw:.0f} deg above {table.max_sigma_yaw_deg:g} deg"
+            )
+        if self._accepted_share < table.min_accepted_share:
+            return Health(State.LOST, f"only {self._accepted_share:.0%} of recent ranges agree with the pose")
+        stale = [f"no {s.what} accepted for {s.age:.1f} s" for s in sources if s.is_stale]
+        if len(stale) == len(sources):
+            return Health(State.LOST, "; ".join(stale))
+        return Health(State.DEGRADED, stale[0]) if stale else Health(State.OK, "")
+
+    def _sources(self, now_ns: int) -> list[_Source]:
+        def source(what: str, seen_ns: int | None, limit: float) -> _Source:
+            since = seen_ns if seen_ns is not None else self._begin_ns
+            age = (now_ns - since) * 1e-9 if since is not None else 0.0
+            return _Source(what, age, age > limit, seen_ns is None)
+
+        table = self._table
+        sources = []
+        if self._has_ranges:
+            sources.append(source("range", self._range_ns, table.max_range_age))
+        if self._has_scans:
+            sources.append(source("LiDAR increment", self._increment_ns, table.max_increment_age))
+        return sources

@@ -1,0 +1,169 @@
+"""The process beside the autopilot: ports and the MAVLink link in threads, everything else in one loop.
+
+The loop logs every chunk before it is decoded and works in the order of the log, so that a replay of
+the log goes through the same steps.
+"""
+
+import queue
+import threading
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from companion.config import Config
+from companion.errors import UserError
+from companion.health import Health
+from companion.log import Direction, LogWriter, RawChunk
+from companion.mavlink.link import NAME as MAVLINK
+from companion.mavlink.link import MavlinkLink
+from companion.mavlink.session import MavlinkSession
+from companion.pipeline import Chain, Tick, make_pipeline
+from companion.replay import tum_line
+from drivers.port import Port, PortEvent, PortStatus, parse_address
+from estimators.messages import PoseEstimate
+
+QUEUE_LENGTH = 10_000
+"""Chunks that may wait for the loop: some ten seconds; what comes on top is dropped and counted."""
+LONGEST_WAIT = 0.02
+"""The loop looks at the dialogues of its devices at least this often [s]."""
+
+
+@dataclass(slots=True)
+class LiveStatus:
+    """What a run shows of itself.
+
+    Attributes:
+        pose: newest pose, or None.
+        health: its judgement, or None before the first tick.
+        poses_sent: poses given to the link.
+        autopilot: system id of the autopilot, None until it was heard.
+        dropped_chunks: chunks lost because the loop could not keep up.
+        stale_ticks: poses not sent because they were computed too late.
+    """
+
+    pose: PoseEstimate | None = None
+    health: Health | None = None
+    poses_sent: int = 0
+    autopilot: int | None = None
+    dropped_chunks: int = 0
+    stale_ticks: int = 0
+
+
+class LiveRun:
+    """One run: opens everything, loops until told to stop, leaves a run folder.
+
+    Args:
+        config: of the site.
+        folder: gets `raw.mcap`, `config.toml` and `poses.tum`.
+        say: takes one line for the operator when a port or the health changes.
+
+    Raises:
+        UserError: the folder cannot be written, or the MAVLink device string makes no sense.
+    """
+
+    def __init__(self, config: Config, folder: Path, say: Callable[[str], None]) -> None:
+        self.status = LiveStatus()
+        self._say = say
+        self._queue: queue.Queue[PortEvent] = queue.Queue(QUEUE_LENGTH)
+        start_ns = time.monotonic_ns()
+        self._log = LogWriter(folder / "raw.mcap", config.to_toml(), start_ns)
+        try:
+            (folder / "config.toml").write_text(config.to_toml(), encoding="utf-8")
+            self._poses = (folder / "poses.tum").open("w", encoding="utf-8", buffering=1)
+        except OSError as error:
+            raise UserError(f"cannot write to {folder}: {error.strerror}") from error
+        self._primary = config.pipeline.estimator
+        self._period_ns = round(1e9 / config.pipeline.rate)
+        self._chain = Chain(config, start_ns, make_pipeline(config, [self._primary]), self._primary)
+        self._ports = {
+            name: Port(name, parse_address(table.port), self._put) for name, table in config.sensor.items()
+        }
+        self._session = MavlinkSession(config.mavlink, config.map_heading())
+        self._link = MavlinkLink(config.mavlink, self._put) if config.mavlink.url else None
+
+    def run(self, stop: threading.Event) -> None:
+        """Work until `stop` is set, then leave the devices quiet and close everything."""
+        for port in self._ports.values():
+            port.start()
+        if self._link is not None:
+            self._link.start()
+        try:
+            while not stop.is_set():
+                self._wait_and_take()
+                self._work(self._chain.advance(time.monotonic_ns()))
+                self._talk_to_devices()
+        finally:
+            self._close()
+
+    def _put(self, event: PortEvent) -> None:
+        try:
+            self._queue.put_nowait(event)
+        except queue.Full:
+            self.status.dropped_chunks += 1
+
+    def _wait_and_take(self) -> None:
+        """Wait for the next event or tick, then take all events that are there."""
+        until_tick = (self._chain.next_tick_ns - time.monotonic_ns()) * 1e-9
+        try:
+            event = self._queue.get(timeout=min(max(until_tick, 0.0), LONGEST_WAIT) or 1e-4)
+            while True:
+                self._take(event)
+                event = self._queue.get_nowait()
+        except queue.Empty:
+            return
+
+    def _take(self, event: PortEvent) -> None:
+        if isinstance(event, PortStatus):
+            self._say(f"{event.name}: {event.message}")
+            if event.is_open and event.name in self._chain.sensors:
+                self._chain.sensors[event.name].connected(event.stamp_ns)
+            return
+        chunk = RawChunk(event.name, Direction.IN, event.stamp_ns, event.data)
+        self._log.raw(chunk)
+        if event.name == MAVLINK:
+            self._session.receive(event.data)
+            self.status.autopilot = self._session.autopilot
+        self._work(self._chain.feed(chunk))
+
+    def _work(self, ticks: Iterable[Tick]) -> None:
+        for tick in ticks:
+            self._give_out(tick)
+
+    def _give_out(self, tick: Tick) -> None:
+        pose = tick.poses[self._primary]
+        if pose is not None:
+            self._poses.write(tum_line(pose))
+        if self.status.health is None or tick.health.state != self.status.health.state:
+            self._say(
+                f"health: {tick.health.state}" + (f" ({tick.health.reason})" * bool(tick.health.reason))
+            )
+        self.status.pose, self.status.health = pose, tick.health
+        now_ns = time.monotonic_ns()
+        if now_ns - tick.stamp_ns > self._period_ns:
+            # The loop fell behind: an autopilot is better off with a gap than with a burst of old poses.
+            self.status.stale_ticks += 1
+            pose = None
+        packed = self._session.poses_packed
+        data = self._session.tick(pose, tick.health, now_ns)
+        if data and self._link is not None and self._link.send(data):
+            self.status.poses_sent += self._session.poses_packed - packed
+            self._log.raw(RawChunk(MAVLINK, Direction.OUT, now_ns, data))
+
+    def _talk_to_devices(self) -> None:
+        for name, sensor in self._chain.sensors.items():
+            self._send(name, sensor.poll(time.monotonic_ns()))
+
+    def _send(self, name: str, data: bytes) -> None:
+        if data and self._ports[name].write(data):
+            self._log.raw(RawChunk(name, Direction.OUT, time.monotonic_ns(), data))
+
+    def _close(self) -> None:
+        for name, sensor in self._chain.sensors.items():
+            self._send(name, sensor.closing())
+        for port in self._ports.values():
+            port.close()
+        if self._link is not None:
+            self._link.close()
+        self._poses.close()
+        self._log.close()

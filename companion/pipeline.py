@@ -1,0 +1,146 @@
+"""The one path from bytes to poses, shared by live runs, replay, simulation and tests.
+
+`Pipeline.step` and `Chain.tick` are pure: no clock, no thread, no I/O. Whoever calls them says what time
+it is. Poses are given at fixed instants (ticks) counted from the start of the run, so a replay of the
+log asks for exactly the poses that the live run gave.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Protocol
+
+from companion.config import Config
+from companion.health import Health, HealthMonitor
+from companion.log import Direction, RawChunk
+from companion.sequencer import Sequencer
+from drivers import make_sensor
+from drivers.framing import Sensor
+from estimators import make_estimator
+from estimators.base import Estimator, Report
+from estimators.lidar.scan_matching import ScanMatcher
+from estimators.messages import Measurement, PoseEstimate, PoseIncrement, Scan
+
+
+class FrontEnd(Protocol):
+    """Turns scans into motion."""
+
+    def update(self, scan: Scan) -> PoseIncrement | None:
+        """Increment up to the end of the scan; None when the scan gives none."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Outcome:
+    """One measurement and what each estimator made of it."""
+
+    measurement: Measurement
+    reports: dict[str, Report]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tick:
+    """All that happened up to one output instant.
+
+    Attributes:
+        stamp_ns: the instant.
+        outcomes: measurements processed since the tick before.
+        poses: estimator name -> pose at `stamp_ns`, None while it has none.
+        health: judgement of the first estimator's pose.
+    """
+
+    stamp_ns: int
+    outcomes: list[Outcome]
+    poses: dict[str, PoseEstimate | None]
+    health: Health
+
+
+class Pipeline:
+    """Front end and estimators side by side on the same measurements.
+
+    Args:
+        front_end: scan matcher.
+        estimators: name -> estimator.
+    """
+
+    def __init__(self, front_end: FrontEnd, estimators: Mapping[str, Estimator]) -> None:
+        self._front_end = front_end
+        self._estimators = dict(estimators)
+
+    def step(self, measurement: Measurement) -> list[Outcome]:
+        """Process one measurement; a scan also yields the outcome of its increment."""
+        outcomes = [self._update(measurement)]
+        if isinstance(measurement, Scan):
+            increment = self._front_end.update(measurement)
+            if increment is not None:
+                outcomes.append(self._update(increment))
+        return outcomes
+
+    def poses_at(self, stamp_ns: int) -> dict[str, PoseEstimate | None]:
+        """Each estimator's pose."""
+        return {name: estimator.pose_at(stamp_ns) for name, estimator in self._estimators.items()}
+
+    def _update(self, measurement: Measurement) -> Outcome:
+        return Outcome(
+            measurement, {name: estimator.update(measurement) for name, estimator in self._estimators.items()}
+        )
+
+
+class Chain:
+    """Bytes in, poses out: decoders, sequencer, pipeline and health of one run.
+
+    Args:
+        config: of the site.
+        start_ns: time of the first tick.
+        pipeline: front end and estimators, the one whose pose is sent first.
+        primary: name of the estimator whose pose is judged and sent.
+    """
+
+    def __init__(self, config: Config, start_ns: int, pipeline: Pipeline, primary: str) -> None:
+        self.sensors: dict[str, Sensor] = {
+            name: make_sensor(table.driver, table.settings) for name, table in config.sensor.items()
+        }
+        self.sequencer = Sequencer(round(config.pipeline.hold_ms * 1e6))
+        self._pipeline = pipeline
+        self._primary = primary
+        drivers = {table.driver for table in config.sensor.values()}
+        self._monitor = HealthMonitor(config.health, "linktrack" in drivers, "rplidar" in drivers)
+        self._start_ns = start_ns
+        self._period_ns = 1e9 / config.pipeline.rate
+        self._ticks = 0
+
+    @property
+    def next_tick_ns(self) -> int:
+        """When the next pose is due."""
+        return self._start_ns + round(self._ticks * self._period_ns)
+
+    def feed(self, chunk: RawChunk) -> Iterator[Tick]:
+        """Give the ticks that were due before these bytes arrived, then decode the bytes."""
+        yield from self.advance(chunk.stamp_ns)
+        sensor = self.sensors.get(chunk.source)
+        if sensor is not None and chunk.direction is Direction.IN:
+            for measurement in sensor.feed(chunk.data, chunk.stamp_ns):
+                self.sequencer.push(measurement)
+
+    def advance(self, now_ns: int) -> Iterator[Tick]:
+        """Give every tick that is due at `now_ns`."""
+        while self.next_tick_ns <= now_ns:
+            yield self._tick(self.next_tick_ns)
+            self._ticks += 1
+
+    def _tick(self, stamp_ns: int) -> Tick:
+        outcomes: list[Outcome] = []
+        for measurement in self.sequencer.release(stamp_ns):
+            for outcome in self._pipeline.step(measurement):
+                self._monitor.observe(outcome.measurement, outcome.reports[self._primary])
+                outcomes.append(outcome)
+        poses = self._pipeline.poses_at(stamp_ns)
+        return Tick(stamp_ns, outcomes, poses, self._monitor.judge(poses[self._primary], stamp_ns))
+
+
+def make_pipeline(config: Config, names: list[str]) -> Pipeline:
+    """Front end and the named estimators with the site's settings."""
+    setup = config.setup()
+    return Pipeline(
+        ScanMatcher(config.scan_matcher, config.lidar_mounting()),
+        {name: make_estimator(name, config.estimator_config(name), setup) for name in names},
+    )

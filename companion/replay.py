@@ -1,0 +1,244 @@
+"""A log through the same decoders and estimators as live, as fast as the processor allows."""
+
+import json
+import time
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+from scipy.spatial.transform import Rotation
+
+from companion import __version__
+from companion.config import Config, config_from_toml
+from companion.errors import UserError
+from companion.evaluate import Accuracy, Errors, Reference, compare
+from companion.log import Log, Truth
+from companion.pipeline import Chain, Pipeline, Tick
+from drivers.framing import DecodeStats
+from estimators import make_estimator
+from estimators.base import Estimator, Report, Verdict
+from estimators.lidar.scan_matching import ScanMatcher
+from estimators.messages import Measurement, PoseEstimate, PoseIncrement, RangeFrame, Scan
+
+
+@dataclass(slots=True)
+class Stopwatch:
+    """Time spent in something that is called often."""
+
+    calls: int = 0
+    seconds: float = 0.0
+
+    @property
+    def mean_ms(self) -> float:
+        """Mean time of a call [ms]."""
+        return 1e3 * self.seconds / self.calls if self.calls else 0.0
+
+
+class _TimedEstimator:
+    """An estimator whose updates are timed."""
+
+    def __init__(self, estimator: Estimator, stopwatch: Stopwatch) -> None:
+        self._estimator = estimator
+        self._stopwatch = stopwatch
+
+    def reset(self) -> None:
+        self._estimator.reset()
+
+    def update(self, measurement: Measurement) -> Report:
+        begin = time.perf_counter()
+        report = self._estimator.update(measurement)
+        if Verdict.NOT_USED not in report.verdicts:
+            self._stopwatch.seconds += time.perf_counter() - begin
+            self._stopwatch.calls += 1
+        return report
+
+    def pose_at(self, stamp_ns: int) -> PoseEstimate | None:
+        return self._estimator.pose_at(stamp_ns)
+
+
+class _TimedMatcher(ScanMatcher):
+    """A scan matcher that is timed."""
+
+    stopwatch: Stopwatch
+
+    def update(self, scan: Scan) -> PoseIncrement | None:
+        begin = time.perf_counter()
+        increment = super().update(scan)
+        self.stopwatch.seconds += time.perf_counter() - begin
+        self.stopwatch.calls += 1
+        return increment
+
+
+@dataclass(slots=True)
+class Replay:
+    """What came out of a log.
+
+    Attributes:
+        config: that was used.
+        names: estimators, the primary first.
+        poses: estimator -> its poses, one per tick at which it had one.
+        errors: estimator -> errors against the log's truth; empty without truth.
+        update_times: estimator (and `scan_matcher`) -> time of its updates.
+        verdicts: estimator -> how often each verdict was given to a range or increment.
+        health: state -> number of ticks.
+        sensors: sensor -> what its decoder counted.
+        late: measurements that came too late to be used.
+        duration: of the log [s].
+        complete: False when the log has a torn end.
+    """
+
+    config: Config
+    names: list[str]
+    poses: dict[str, list[PoseEstimate]]
+    errors: dict[str, Errors] = field(default_factory=dict)
+    update_times: dict[str, Stopwatch] = field(default_factory=dict)
+    verdicts: dict[str, Counter[str]] = field(default_factory=dict)
+    health: Counter[str] = field(default_factory=Counter)
+    sensors: dict[str, DecodeStats] = field(default_factory=dict)
+    late: int = 0
+    duration: float = 0.0
+    complete: bool = True
+
+    def accuracy(self, name: str) -> Accuracy | None:
+        """Figures of one estimator; None without truth or poses."""
+        return self.errors[name].accuracy() if name in self.errors else None
+
+
+def config_of(log: Log, sets: list[str]) -> Config:
+    """The configuration stored in a log, with `--set` assignments applied.
+
+    Raises:
+        UserError: an assignment is wrong, or the stored configuration does not fit this version.
+    """
+    return config_from_toml(log.config_toml, f"{log.path} (recorded by version {log.version})", sets)
+
+
+def replay(
+    log: Log,
+    config: Config,
+    names: list[str],
+    on_tick: Callable[[Tick, Truth | None], None] | None = None,
+    on_progress: Callable[[float], None] | None = None,
+) -> Replay:
+    """Run a log through the pipeline.
+
+    Args:
+        log: to read.
+        config: usually `config_of(log)`.
+        names: estimators to run side by side, the primary first.
+        on_tick: called for every tick with the newest truth before it.
+        on_progress: called now and then with the share of the log that is done.
+
+    Raises:
+        UserError: the log holds no bytes of any sensor of the site.
+    """
+    begin_ns = last_ns = log.start_ns
+    result = Replay(config, names, {name: [] for name in names})
+    result.update_times = {name: Stopwatch() for name in ["scan_matcher", *names]}
+    result.verdicts = {name: Counter() for name in names}
+    chain = Chain(config, begin_ns, _timed_pipeline(config, names, result.update_times), names[0])
+    truths: list[Truth] = []
+    ticks_ns: list[int] = []
+
+    def take(tick: Tick) -> None:
+        ticks_ns.append(tick.stamp_ns)
+        result.health[tick.health.state] += 1
+        for outcome in tick.outcomes:
+            if isinstance(outcome.measurement, RangeFrame | PoseIncrement):
+                for name, report in outcome.reports.items():
+                    result.verdicts[name].update(report.verdicts)
+        for name, pose in tick.poses.items():
+            if pose is not None:
+                result.poses[name].append(pose)
+        if on_tick is not None:
+            on_tick(tick, truths[-1] if truths else None)
+        if on_progress is not None:
+            on_progress(log.share_read)
+
+    fed = 0
+    for record in log:
+        if isinstance(record, Truth):
+            truths.append(record)
+            continue
+        fed += record.source in chain.sensors
+        for tick in chain.feed(record):
+            take(tick)
+        last_ns = max(last_ns, record.stamp_ns)
+    if not fed:
+        wanted = ", ".join(chain.sensors) or "none"
+        raise UserError(f"{log.path}: no bytes of the site's sensors in it (sensors: {wanted})")
+
+    result.duration = (last_ns - begin_ns) * 1e-9
+    result.complete = log.complete
+    result.late = chain.sequencer.late
+    result.sensors = {name: sensor.stats for name, sensor in chain.sensors.items()}
+    if truths:
+        reference = Reference(truths)
+        covered = sum(reference.covers(stamp_ns) for stamp_ns in ticks_ns)
+        result.errors = {name: compare(result.poses[name], reference, covered) for name in names}
+    return result
+
+
+def write_outputs(result: Replay, folder: Path) -> None:
+    """Write `poses.tum` (and `poses_NAME.tum` of further estimators), `summary.json`, `config.toml`.
+
+    Raises:
+        UserError: the folder cannot be written.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for i, name in enumerate(result.names):
+            text = "".join(tum_line(pose) for pose in result.poses[name])
+            (folder / (f"poses_{name}.tum" if i else "poses.tum")).write_text(text, encoding="utf-8")
+        (folder / "summary.json").write_text(json.dumps(summary(result), indent=2) + "\n", encoding="utf-8")
+        (folder / "config.toml").write_text(result.config.to_toml(), encoding="utf-8")
+    except OSError as error:
+        raise UserError(f"cannot write to {folder}: {error.strerror}") from error
+
+
+def tum_line(pose: PoseEstimate) -> str:
+    """One line of a TUM trajectory: seconds, position [m], quaternion x y z w."""
+    seconds, nanoseconds = divmod(pose.stamp_ns, 1_000_000_000)
+    quat_xyzw = Rotation.from_matrix(pose.T_map_body[:3, :3]).as_quat(canonical=True)
+    numbers = " ".join(f"{value:.9f}" for value in [*pose.T_map_body[:3, 3], *quat_xyzw])
+    return f"{seconds}.{nanoseconds:09d} {numbers}\n"
+
+
+def summary(result: Replay) -> dict[str, object]:
+    """The figures of a replay as plain data."""
+    estimators = {
+        name: {
+            "accuracy": asdict(accuracy) if (accuracy := result.accuracy(name)) else None,
+            "update_ms": result.update_times[name].mean_ms,
+            "verdicts": dict(result.verdicts[name]),
+        }
+        for name in result.names
+    }
+    return {
+        "version": __version__,
+        "site": result.config.site.name,
+        "duration_s": result.duration,
+        "complete": result.complete,
+        "primary": result.names[0],
+        "estimators": estimators,
+        "scan_matcher_ms": result.update_times["scan_matcher"].mean_ms,
+        "health_ticks": dict(result.health),
+        "late_measurements": result.late,
+        "sensors": {name: asdict(stats) for name, stats in result.sensors.items()},
+    }
+
+
+def _timed_pipeline(config: Config, names: list[str], update_times: dict[str, Stopwatch]) -> Pipeline:
+    matcher = _TimedMatcher(config.scan_matcher, config.lidar_mounting())
+    matcher.stopwatch = update_times["scan_matcher"]
+    setup = config.setup()
+    return Pipeline(
+        matcher,
+        {
+            name: _TimedEstimator(
+                make_estimator(name, config.estimator_config(name), setup), update_times[name]
+            )
+            for name in names
+        },
+    )

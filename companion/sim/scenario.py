@@ -1,0 +1,154 @@
+"""Scenario files: a world, a walk and sensors with their faults, all from one seed."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from pydantic import Field
+
+from companion.config import Config, Coordinate, Table, load_config, parse_toml, read_text, validated
+from companion.errors import UserError
+from companion.sim.trajectory import Trajectory
+from companion.sim.world import World
+
+
+class BoxTable(Table):
+    """An obstacle that a LiDAR sees and that blocks ranges passing below its top."""
+
+    centre: tuple[Coordinate, Coordinate]
+    size: tuple[float, float] = Field(description="lengths along its own axes [m]")
+    yaw_deg: float = 0.0
+    height: float = Field(2.5, gt=0, le=10, description="[m]")
+
+
+class WorldTable(Table):
+    """Obstacles; the walls are those of the site file."""
+
+    boxes: list[BoxTable] = Field(default_factory=list)
+
+
+class TrajectoryTable(Table):
+    """Where the robot walks."""
+
+    waypoints: list[tuple[Coordinate, Coordinate]] = Field(min_length=2)
+    laps: int = Field(1, ge=0, le=1000, description="times round the closed path; 0: open path")
+    speed: float = Field(0.5, gt=0, le=10, description="[m/s]")
+    accel: float = Field(0.5, gt=0, le=20, description="[m/s^2]")
+    turn_rate_deg: float = Field(60.0, gt=0, le=360, description="[deg/s]")
+    rest: float = Field(2.0, ge=0, le=600, description="standing still before and after [s]")
+
+
+class UwbTable(Table):
+    """The LinkTrack tag and how its ranges err."""
+
+    frame: Literal["node_frame2", "node_frame3", "tag_frame0"] = "node_frame2"
+    rate: float = Field(25.0, ge=1, le=200, description="frames a second [Hz]")
+    sigma: float = Field(0.10, ge=0, le=5, description="standard deviation of a range [m]")
+    nlos_least: float = Field(0.2, ge=0, le=10, description="least bias of a blocked range [m]")
+    nlos_mean: float = Field(0.3, ge=0, le=10, description="mean of the exponential bias on top of that [m]")
+    dropout: float = Field(0.02, ge=0, lt=1, description="share of ranges that fail")
+
+
+class LidarTable(Table):
+    """The RPLIDAR and how its ranges err."""
+
+    model: Literal["A1", "A2", "S1"] = "A2"
+    rotation_hz: float = Field(10.0, ge=2, le=20, description="revolutions a second [Hz]")
+    sigma: float = Field(0.015, ge=0, le=1, description="standard deviation of a distance [m]")
+    dropout: float = Field(0.02, ge=0, lt=1, description="share of beams that return nothing")
+    min_range: float = Field(0.15, ge=0, le=10, description="[m]")
+    max_range: float = Field(12.0, gt=0, le=100, description="[m]")
+    height: float = Field(0.1, ge=0, le=5, description="scan plane above the body origin [m]")
+
+
+class ImuTable(Table):
+    """The tag's inertial sensor and how it errs."""
+
+    gyro_sigma: float = Field(0.01, ge=0, le=1, description="[rad/s]")
+    gyro_bias: float = Field(0.005, ge=0, le=1, description="standard deviation of the bias [rad/s]")
+    accel_sigma: float = Field(0.05, ge=0, le=10, description="[m/s^2]")
+
+
+class ScenarioFile(Table):
+    """A scenario file as written."""
+
+    description: str = ""
+    site: str = Field(description="site file, relative to the scenario file")
+    seed: int = Field(1, ge=0)
+    trajectory: TrajectoryTable
+    world: WorldTable = Field(default_factory=WorldTable)
+    uwb: UwbTable = Field(default_factory=UwbTable)
+    lidar: LidarTable = Field(default_factory=LidarTable)
+    imu: ImuTable = Field(default_factory=ImuTable)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scenario:
+    """A scenario with its seed drawn: ready to run.
+
+    Attributes:
+        name: the file's name without ending.
+        file: the settings as written.
+        config: the site's configuration.
+        seed: of everything random in it.
+        world: walls and boxes.
+        trajectory: the true walk, its start displaced as the site's start sigma says.
+        rng: where the sensors draw their noise from.
+    """
+
+    name: str
+    file: ScenarioFile
+    config: Config
+    seed: int
+    world: World
+    trajectory: Trajectory
+    rng: np.random.Generator
+
+
+def load_scenario(path: Path, seed: int | None, sets: list[str]) -> Scenario:
+    """Read a scenario and its site.
+
+    Args:
+        path: scenario file.
+        seed: instead of the file's own.
+        sets: `--set` assignments on the site's configuration.
+
+    Raises:
+        UserError: a file is missing or wrong.
+    """
+    file = validated(ScenarioFile, parse_toml(read_text(path), str(path)), str(path))
+    config = load_config(path.parent / file.site, sets)
+    if len(config.site.walls) == 0 and not file.world.boxes:
+        raise UserError(f"{path}: the site has no walls and the scenario no boxes, the LiDAR sees nothing")
+    walk = file.trajectory
+    start = config.setup().start
+    seed = file.seed if seed is None else seed
+    rng = np.random.default_rng(seed)
+    boxes = [(*b.centre, *b.size, float(np.deg2rad(b.yaw_deg)), b.height) for b in file.world.boxes]
+    # The operator sets the robot down on its mark as well as the site file says, not better.
+    placement = rng.standard_normal(3) * start.sigma
+    trajectory = Trajectory(
+        walk.waypoints,
+        walk.laps,
+        walk.speed,
+        walk.accel,
+        float(np.deg2rad(walk.turn_rate_deg)),
+        walk.rest,
+        placement,
+    )
+    if not np.allclose(trajectory.start, start.pose, atol=1e-3):
+        x, y, yaw = trajectory.start
+        raise UserError(
+            f"{path}: the walk begins at ({x:g}, {y:g}) facing {np.rad2deg(yaw):g} deg, but the site's "
+            f"[start] is ({start.pose[0]:g}, {start.pose[1]:g}), {np.rad2deg(start.pose[2]):g} deg"
+        )
+    return Scenario(
+        name=path.stem,
+        file=file,
+        config=config,
+        seed=seed,
+        world=World([list(wall) for wall in config.site.walls], boxes),
+        trajectory=trajectory,
+        rng=rng,
+    )

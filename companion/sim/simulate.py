@@ -1,0 +1,76 @@
+"""Emulated devices and real drivers joined in memory, in simulated time."""
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+from companion.log import Direction, LogWriter, RawChunk, Truth
+from companion.sim.devices import Robot, make_devices
+from companion.sim.scenario import Scenario
+from drivers import make_sensor
+from drivers.framing import Sensor
+
+START_NS = 1_000_000_000
+"""Host's monotonic time at which a simulation begins; not 0, as no real one is."""
+STEP_NS = 4_000_000
+"""Ports are read this often, about as a USB serial adapter hands bytes over."""
+TRUTH_EVERY = 5
+"""Steps from one true pose to the next in the log: 50 Hz."""
+
+
+def converse(scenario: Scenario, sensors: Mapping[str, Sensor]) -> Iterator[RawChunk | Truth]:
+    """Everything that crosses the ports while the robot walks, and the truth.
+
+    The caller feeds the incoming chunks to `sensors`, whose dialogue this function carries out.
+
+    Args:
+        scenario: to run from `START_NS` until the walk is over.
+        sensors: the drivers, by the site's sensor names.
+    """
+    robot = Robot(scenario)
+    devices = make_devices(robot, START_NS)
+    for sensor in sensors.values():
+        sensor.connected(START_NS)
+    step, now_ns = 0, START_NS
+    # A LiDAR that never scans would leave the robot waiting: the walk begins without it.
+    if "rplidar" not in {table.driver for table in scenario.config.sensor.values()}:
+        robot.begin(now_ns)
+    while not robot.arrived(now_ns):
+        for name, device in devices.items():
+            data = device.poll(now_ns)
+            if data:
+                yield RawChunk(name, Direction.IN, now_ns, data)
+            request = sensors[name].poll(now_ns)
+            if request:
+                yield RawChunk(name, Direction.OUT, now_ns, request)
+                device.feed(request, now_ns)
+        if step % TRUTH_EVERY == 0:
+            yield Truth(now_ns, robot.motion(now_ns).pose[0])
+        step += 1
+        now_ns += STEP_NS
+
+
+def simulate(scenario: Scenario, path: Path) -> Iterator[float]:
+    """Write the log of a run without estimators; gives the share that is done, now and then.
+
+    Args:
+        scenario: to run.
+        path: log to write.
+
+    Raises:
+        UserError: the log cannot be written.
+    """
+    sensors = {
+        name: make_sensor(table.driver, table.settings) for name, table in scenario.config.sensor.items()
+    }
+    writer = LogWriter(path, scenario.config.to_toml(), START_NS)
+    try:
+        for record in converse(scenario, sensors):
+            if isinstance(record, Truth):
+                writer.truth(record)
+                yield (record.stamp_ns - START_NS) * 1e-9 / scenario.trajectory.duration
+            else:
+                writer.raw(record)
+                if record.direction is Direction.IN:
+                    sensors[record.source].feed(record.data, record.stamp_ns)
+    finally:
+        writer.close()

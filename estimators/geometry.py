@@ -1,0 +1,61 @@
+"""Planar rigid motions as (x, y, yaw) vectors, and their lift to 4x4 transforms.
+
+`T_a_b` written as a vector takes coordinates of frame b to frame a: ``p_a = R(yaw) p_b + (x, y)``.
+Conventions follow the README's frame table: right-handed, z up, angles counter-clockwise.
+"""
+
+from math import cos, pi, sin
+
+import numpy as np
+
+from estimators.messages import FloatArray
+
+
+def wrap_angle(angle: float) -> float:
+    """Angle [rad] brought into [-pi, pi)."""
+    return (angle + pi) % (2.0 * pi) - pi
+
+
+def rotation(yaw: float) -> FloatArray:
+    """Rotation matrix `R_a_b`, (2, 2), of frame b turned by `yaw` [rad] against frame a."""
+    c, s = cos(yaw), sin(yaw)
+    return np.array([[c, -s], [s, c]])
+
+
+def compose(T_a_b: FloatArray, T_b_c: FloatArray) -> FloatArray:
+    """`T_a_c` of two planar motions, all (3,) of x [m], y [m], yaw [rad]."""
+    c, s = cos(T_a_b[2]), sin(T_a_b[2])
+    return np.array(
+        [
+            T_a_b[0] + c * T_b_c[0] - s * T_b_c[1],
+            T_a_b[1] + s * T_b_c[0] + c * T_b_c[1],
+            wrap_angle(T_a_b[2] + T_b_c[2]),
+        ]
+    )
+
+
+def inverse(T_a_b: FloatArray) -> FloatArray:
+    """`T_b_a`, (3,)."""
+    c, s = cos(T_a_b[2]), sin(T_a_b[2])
+    return np.array(
+        [-c * T_a_b[0] - s * T_a_b[1], s * T_a_b[0] - c * T_a_b[1], wrap_angle(-T_a_b[2])],
+    )
+
+
+def between(T_w_a: FloatArray, T_w_b: FloatArray) -> FloatArray:
+    """`T_a_b`: pose b seen from pose a, (3,)."""
+    return compose(inverse(T_w_a), T_w_b)
+
+
+def transform(T_a_b: FloatArray, points_b: FloatArray) -> FloatArray:
+    """Points (N, 2) of frame b in frame a."""
+    return points_b @ rotation(T_a_b[2]).T + T_a_b[:2]
+
+
+def lift(planar: FloatArray, z: float) -> FloatArray:
+    """4x4 transform of a level body at (x, y, yaw) and height `z` [m]."""
+    T = np.eye(4)
+    T[:2, :2] = rotation(planar[2])
+    T[:2, 3] = planar[:2]
+    T[2, 3] = z
+    return T

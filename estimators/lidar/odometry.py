@@ -1,0 +1,141 @@
+"""LiDAR alone: dead reckoning from the start pose on the scan matcher's increments.
+
+State, (9,): pose (x, y, yaw) and velocity (vx, vy, yaw rate) in the map, and the pose at which the
+odometry's current keyframe was taken. Keeping that pose in the state (a stochastic clone) makes an
+increment exactly what it is, a measurement between two poses that are both uncertain and correlated.
+"""
+
+import numpy as np
+from filterpy.kalman import ExtendedKalmanFilter
+from pydantic import BaseModel, ConfigDict, Field
+from scipy.stats import chi2
+
+from estimators.base import Report, Setup, Verdict
+from estimators.geometry import lift, wrap_angle
+from estimators.messages import FloatArray, Measurement, PoseEstimate, PoseIncrement, RangeFrame
+from estimators.models.motion import constant_velocity, increment
+
+POSE = slice(0, 3)
+MOVING = slice(0, 6)
+REFERENCE = slice(6, 9)
+START_SPEED_SIGMA = 0.3
+"""The robot stands or starts slowly: standard deviation of each velocity at the start [m/s, rad/s]."""
+
+
+class LidarOdometry:
+    """Kalman filter (filterpy) on increments only; what drifts here is what UWB must hold.
+
+    Source: huang2024 Table 4, row "LiDAR"; stochastic cloning: Roumeliotis and Burdick, ICRA 2002.
+    """
+
+    class Config(BaseModel):
+        """Settings of `lidar_odometry`."""
+
+        model_config = ConfigDict(extra="forbid", frozen=True)
+
+        increment_gate: float = Field(
+            0.99999, gt=0.5, lt=1, description="share of good increments that pass the NIS gate"
+        )
+        accel_noise: float = Field(
+            0.8, gt=0, le=100, description="density of white acceleration [m/s^2/sqrt(Hz)]"
+        )
+        yaw_accel_noise: float = Field(
+            2.0, gt=0, le=100, description="density of white angular acceleration [rad/s^2/sqrt(Hz)]"
+        )
+
+    def __init__(self, config: Config, setup: Setup) -> None:
+        self._setup = setup
+        self._noise = (config.accel_noise, config.yaw_accel_noise)
+        self._increment_gate = float(chi2.ppf(config.increment_gate, 3))
+        self.reset()
+
+    def reset(self) -> None:
+        """Stand at the start again; the first measurement sets the clock."""
+        start = self._setup.start
+        self._filter = ExtendedKalmanFilter(dim_x=9, dim_z=3)
+        self._filter.x = np.concatenate([start.pose, np.zeros(3), start.pose])
+        sigma = np.concatenate([start.sigma, np.full(3, START_SPEED_SIGMA), start.sigma])
+        self._filter.P = np.diag(sigma**2)
+        self._stamp_ns: int | None = None
+        self._reference_stamp_ns: int | None = None
+
+    @property
+    def state(self) -> tuple[FloatArray, FloatArray]:
+        """State (9,) and covariance (9, 9) at the newest measurement, for tests and views."""
+        return self._filter.x.copy(), self._filter.P.copy()
+
+    def update(self, measurement: Measurement) -> Report:
+        """Predict to an increment's time and take it; other measurements are not used."""
+        if isinstance(measurement, PoseIncrement):
+            if not self._predict_to(measurement.stamp_ns):
+                return Report((Verdict.LATE,))
+            report = self._update_increment(measurement)
+            if measurement.is_keyframe:
+                self._clone_reference(measurement.stamp_ns)
+            return report
+        count = len(measurement.ranges) if isinstance(measurement, RangeFrame) else 1
+        return Report((Verdict.NOT_USED,) * count)
+
+    def pose_at(self, stamp_ns: int) -> PoseEstimate | None:
+        """Pose predicted with constant velocity; None before the first measurement."""
+        if self._stamp_ns is None:
+            return None
+        F, Q = self._motion((stamp_ns - self._stamp_ns) * 1e-9)
+        mean = F @ self._filter.x[MOVING]
+        cov = (F @ self._filter.P[MOVING, MOVING] @ F.T + Q)[POSE, POSE]
+        T_map_body = lift(mean[POSE], self._setup.height)
+        return PoseEstimate(stamp_ns, T_map_body, self._setup.lift_covariance(cov), 0)
+
+    def _motion(self, dt: float) -> tuple[FloatArray, FloatArray]:
+        return constant_velocity(dt, *self._noise)
+
+    def _predict_to(self, stamp_ns: int) -> bool:
+        if self._stamp_ns is not None:
+            dt = (stamp_ns - self._stamp_ns) * 1e-9
+            if dt < 0.0:
+                return False
+            F, Q = np.eye(9), np.zeros((9, 9))
+            F[MOVING, MOVING], Q[MOVING, MOVING] = self._motion(dt)
+            self._filter.F, self._filter.Q = F, Q
+            self._filter.predict()
+        self._stamp_ns = stamp_ns
+        return True
+
+    def _update_increment(self, measured: PoseIncrement) -> Report:
+        if measured.from_stamp_ns == measured.stamp_ns:
+            return Report((Verdict.ACCEPTED,))
+        if measured.from_stamp_ns != self._reference_stamp_ns:
+            return Report((Verdict.NO_REFERENCE,))
+        predicted, by_reference, by_pose = increment(self._filter.x[REFERENCE], self._filter.x[POSE])
+        H = np.zeros((3, 9))
+        H[:, POSE], H[:, REFERENCE] = by_pose, by_reference
+        innovation = _increment_residual(measured.increment, predicted)
+        S = H @ self._filter.P @ H.T + measured.cov
+        nis = float(innovation @ np.linalg.solve(S, innovation))
+        report = np.full(1, np.nan), np.array([nis])
+        # A NaN compares false with everything, so ask for what must hold, not for what must not.
+        if not nis <= self._increment_gate:
+            return Report((Verdict.GATED,), *report)
+        self._correct(measured.increment, H, predicted, measured.cov)
+        return Report((Verdict.ACCEPTED,), *report)
+
+    def _correct(self, measured: FloatArray, H: FloatArray, predicted: FloatArray, R: FloatArray) -> None:
+        residual = np.subtract if len(measured) == 1 else _increment_residual
+        self._filter.update(measured, lambda _: H, lambda _: predicted, R=R, residual=residual)
+        for i in (2, 8):
+            self._filter.x[i] = wrap_angle(self._filter.x[i])
+        self._filter.P = 0.5 * (self._filter.P + self._filter.P.T)
+
+    def _clone_reference(self, stamp_ns: int) -> None:
+        copy = np.eye(9)
+        copy[REFERENCE, REFERENCE] = 0.0
+        copy[REFERENCE, POSE] = np.eye(3)
+        self._filter.x = copy @ self._filter.x
+        self._filter.P = copy @ self._filter.P @ copy.T
+        self._reference_stamp_ns = stamp_ns
+
+
+def _increment_residual(measured: FloatArray, predicted: FloatArray) -> FloatArray:
+    residual = measured - predicted
+    residual[2] = wrap_angle(residual[2])
+    return residual

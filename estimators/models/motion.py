@@ -1,0 +1,55 @@
+"""Planar motion: constant velocity with white acceleration, and the odometry increment between two poses."""
+
+from math import cos, sin
+
+import numpy as np
+
+from estimators.geometry import between
+from estimators.messages import FloatArray
+
+
+def constant_velocity(dt: float, accel_noise: float, yaw_accel_noise: float) -> tuple[FloatArray, FloatArray]:
+    """Transition and process noise of (x, y, yaw, vx, vy, yaw rate), velocities along the map axes.
+
+    Args:
+        dt: time step [s]; negative steps look back, their noise is that of the positive step.
+        accel_noise: density of the white acceleration [m/s^2/sqrt(Hz)].
+        yaw_accel_noise: density of the white angular acceleration [rad/s^2/sqrt(Hz)].
+
+    Returns:
+        F (6, 6) and Q (6, 6).
+
+    Source: Bar-Shalom et al., Estimation with Applications to Tracking and Navigation, 6.2.2.
+    """
+    F = np.eye(6)
+    F[0, 3] = F[1, 4] = F[2, 5] = dt
+    step = abs(dt)
+    Q = np.zeros((6, 6))
+    for i, density in enumerate((accel_noise, accel_noise, yaw_accel_noise)):
+        power = density * density
+        Q[i, i] = power * step**3 / 3.0
+        Q[i, i + 3] = Q[i + 3, i] = power * step * dt / 2.0
+        Q[i + 3, i + 3] = power * step
+    return F, Q
+
+
+def increment(reference: FloatArray, pose: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Increment that odometry should report, with its Jacobians.
+
+    Args:
+        reference: (3,) earlier pose in the map.
+        pose: (3,) newer pose in the map.
+
+    Returns:
+        Increment (3,) in the reference's body frame, its derivative by the reference (3, 3) and by
+        the pose (3, 3).
+
+    Source: chen2019 Eq. (5)-(20), displacement and rotation as one planar motion; Jacobians chosen here.
+    """
+    value = between(reference, pose)
+    c, s = cos(reference[2]), sin(reference[2])
+    by_pose = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+    by_reference = -by_pose
+    by_reference[0, 2] = value[1]
+    by_reference[1, 2] = -value[0]
+    return value, by_reference, by_pose

@@ -1,0 +1,56 @@
+"""UWB range from a planar robot to an anchor: height reduction, value, Jacobian, covariance."""
+
+from math import cos, hypot, isfinite, sin, sqrt
+
+import numpy as np
+
+from estimators.messages import FloatArray
+
+MIN_HORIZONTAL_RANGE = 0.05
+"""Below this [m] the tag stands under the anchor: the horizontal range has no usable direction."""
+
+
+def reduce_height(slant: float, sigma: float, height_difference: float) -> tuple[float, float] | None:
+    """Horizontal distance from tag to anchor and its standard deviation.
+
+    Args:
+        slant: measured distance [m].
+        sigma: its standard deviation [m].
+        height_difference: anchor height minus tag height [m].
+
+    Returns:
+        Horizontal range [m] and sigma [m]; None when the slant range is shorter than the height
+        difference (negative radicand), not finite, or too near the vertical to say anything.
+
+    Source: huang2024 Eq. (3); sigma by first-order propagation, ``sigma_r = sigma_d d / r``.
+    """
+    if not isfinite(slant):
+        return None
+    square = slant * slant - height_difference * height_difference
+    if slant <= 0.0 or square < MIN_HORIZONTAL_RANGE**2:
+        return None
+    horizontal = sqrt(square)
+    return horizontal, sigma * slant / horizontal
+
+
+def horizontal_range(pose: FloatArray, anchor: FloatArray, lever_arm: FloatArray) -> tuple[float, FloatArray]:
+    """Predicted horizontal range and its Jacobian.
+
+    Args:
+        pose: (3,) x [m], y [m], yaw [rad] of the body in the map.
+        anchor: (2,) or (3,) position in the map [m]; only x and y are used.
+        lever_arm: (2,) or (3,) tag antenna in the body frame [m]; only x and y are used.
+
+    Returns:
+        Range [m] and its derivative by (x, y, yaw), (3,).
+
+    Source: chen2019 Eq. (5)-(20), measurement model chosen here, with a lever arm.
+    """
+    c, s = cos(pose[2]), sin(pose[2])
+    arm_x = c * lever_arm[0] - s * lever_arm[1]
+    arm_y = s * lever_arm[0] + c * lever_arm[1]
+    dx = pose[0] + arm_x - anchor[0]
+    dy = pose[1] + arm_y - anchor[1]
+    distance = max(hypot(dx, dy), 1e-9)
+    ux, uy = dx / distance, dy / distance
+    return distance, np.array([ux, uy, uy * arm_x - ux * arm_y])

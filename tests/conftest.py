@@ -1,0 +1,42 @@
+"""Fixtures shared by all tests."""
+
+from pathlib import Path
+
+import pytest
+
+from companion.config import Config, load_config, params_dir
+from companion.sim.scenario import Scenario, load_scenario
+from companion.sim.simulate import simulate
+
+SCENARIO = params_dir() / "scenarios" / "square_room.toml"
+SITE = params_dir() / "sites" / "demo_room.toml"
+
+SHORT_WALK = "[trajectory]\nwaypoints = [[1.5, 1.2], [3.5, 1.2], [3.5, 2.4]]\nlaps = 0\nrest = 1.0\n"
+"""Some 11 s: two legs and one turn."""
+
+
+def write_scenario(folder: Path, trajectory: str = SHORT_WALK, more: str = "") -> Path:
+    """A scenario in the demo's room with another walk and other sensors."""
+    path = folder / "scenario.toml"
+    path.write_text(f'site = "{SITE}"\n{trajectory}{more}', encoding="utf-8")
+    return path
+
+
+def write_log(scenario: Scenario, path: Path) -> Path:
+    """Log of a scenario."""
+    for _ in simulate(scenario, path):
+        pass
+    return path
+
+
+@pytest.fixture
+def config() -> Config:
+    """Configuration of the demo room."""
+    return load_config(SITE)
+
+
+@pytest.fixture(scope="session")
+def short_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Log of a short walk in the demo's room."""
+    folder = tmp_path_factory.mktemp("short")
+    return write_log(load_scenario(write_scenario(folder), 3, []), folder / "short.mcap")
