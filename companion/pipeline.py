@@ -18,7 +18,7 @@ from drivers.framing import Sensor
 from estimators import make_estimator
 from estimators.base import Estimator, Report
 from estimators.lidar.scan_matching import ScanMatcher
-from estimators.messages import Measurement, PoseEstimate, PoseIncrement, Scan
+from estimators.messages import Measurement, PoseEstimate, PoseIncrement, RangeFrame, Scan
 
 
 class FrontEnd(Protocol):
@@ -102,8 +102,8 @@ class Chain:
         self.sequencer = Sequencer(round(config.pipeline.hold_ms * 1e6))
         self._pipeline = pipeline
         self._primary = primary
-        drivers = {table.driver for table in config.sensor.values()}
-        self._monitor = HealthMonitor(config.health, "linktrack" in drivers, "rplidar" in drivers)
+        measured = {kind for sensor in self.sensors.values() for kind in sensor.MEASURES}
+        self._monitor = HealthMonitor(config.health, RangeFrame in measured, Scan in measured)
         self._start_ns = start_ns
         self._period_ns = 1e9 / config.pipeline.rate
         self._ticks = 0

@@ -6,7 +6,7 @@ port, a pseudo-terminal, an emulator in memory and the replay of a log.
 """
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 from estimators.messages import Measurement
 
@@ -32,6 +32,9 @@ class DecodeStats:
 
 class Sensor(Protocol):
     """A device on a byte stream: decoder of its answers and, where it has one, its command dialogue."""
+
+    MEASURES: ClassVar[frozenset[type]]
+    """Types of the measurements it makes."""
 
     stats: DecodeStats
 

@@ -4,6 +4,8 @@ This is the only input and output on the sensors' side. Bytes go to a sink (a qu
 of the port as `PortStatus`; nothing here knows what the bytes mean.
 """
 
+import errno
+import os
 import threading
 import time
 from collections.abc import Callable
@@ -190,6 +192,10 @@ def _open(address: PortAddress) -> serial.SerialBase:
 
 
 def _reason(error: Exception) -> str:
-    """The operating system's own words; pyserial wraps them in text that repeats the port's name."""
-    cause = getattr(error, "strerror", None) or str(error)
-    return cause.split("could not open port", 1)[-1].split(": ", 1)[-1].strip() or type(error).__name__
+    """The operating system's own words: pyserial wraps them, or gives only a number."""
+    number = error.errno if isinstance(error, OSError) else None
+    if number is None:
+        return str(error)
+    if number == errno.EAGAIN:
+        return "in use by another program"
+    return os.strerror(number)

@@ -8,18 +8,18 @@ import struct
 from collections import deque
 from enum import Enum, auto
 from itertools import pairwise
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from drivers.framing import DecodeStats
+from drivers.rplidar_decoder import AnswerDecoder
 from drivers.rplidar_protocol import (
     PACKET_BYTES,
     PACKET_SAMPLES,
     AccBoardFlag,
     Answer,
-    AnswerDecoder,
     AnswerType,
     Command,
     DeviceInfo,
@@ -140,6 +140,8 @@ class Rplidar:
             if self.min_range >= self.max_range:
                 raise ValueError(f"min_range {self.min_range} is not below max_range {self.max_range}")
             return self
+
+    MEASURES: ClassVar[frozenset[type]] = frozenset({Scan})
 
     def __init__(self, config: Config) -> None:
         self.stats = DecodeStats()

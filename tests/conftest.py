@@ -14,11 +14,14 @@ SITE = params_dir() / "sites" / "demo_room.toml"
 SHORT_WALK = "[trajectory]\nwaypoints = [[1.5, 1.2], [3.5, 1.2], [3.5, 2.4]]\nlaps = 0\nrest = 1.0\n"
 """Some 11 s: two legs and one turn."""
 
+COLUMN = "[[world.boxes]]\ncentre = [4.0, 3.6]\nsize = [0.6, 0.6]\nheight = 3.0\n"
+"""It hides an anchor from some places."""
+
 
 def write_scenario(folder: Path, trajectory: str = SHORT_WALK, more: str = "") -> Path:
     """A scenario in the demo's room with another walk and other sensors."""
     path = folder / "scenario.toml"
-    path.write_text(f'site = "{SITE}"\n{trajectory}{more}', encoding="utf-8")
+    path.write_text(f'site = "{SITE}"\n{trajectory}{more}{COLUMN}', encoding="utf-8")
     return path
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from companion.sim.scenario import ImuTable, LidarTable, Scenario, UwbTable
 from companion.sim.trajectory import Motion
-from drivers.linktrack import Frame, NodeFrame2, NodeFrame3, NodeRange, TagFrame0, encode
+from drivers.linktrack_frames import Frame, NodeFrame2, NodeFrame3, NodeRange, TagFrame0, encode
 from drivers.rplidar_protocol import (
     PACKET_SAMPLES,
     AccBoardFlag,
@@ -232,7 +232,7 @@ class RplidarDevice:
             self._samples_sent += count
             directions, distances = self._measure(first, count)
             if self._scan_type is AnswerType.STANDARD_SCAN:
-                out += self._standard_nodes(directions, distances)
+                out += self._standard_nodes(first, directions, distances)
             else:
                 out += self._express_capsules(directions, distances, is_first=first == 0)
         return out
@@ -251,10 +251,16 @@ class RplidarDevice:
         self._sample_ns = sample_us * 1000
         self._samples_sent = 0
 
+    def _turns(self, first: int, count: int) -> FloatArray:
+        """Revolutions since the scan began, when each of the samples was taken."""
+        taken = np.arange(first + 1, first + count + 1, dtype=np.float64)
+        return taken * (self._sample_ns * 1e-9 * self._lidar.rotation_hz)
+
     def _measure(self, first: int, count: int) -> tuple[FloatArray, FloatArray]:
         """Directions [deg], clockwise from forward, and distances [m] of consecutive samples."""
-        since_scan = np.arange(first + 1, first + count + 1, dtype=np.float64) * (self._sample_ns * 1e-9)
-        directions: FloatArray = 360.0 * ((self._lidar.rotation_hz * since_scan) % 1.0)
+        turns = self._turns(first, count)
+        directions = 360.0 * (turns % 1.0)
+        since_scan = turns / self._lidar.rotation_hz
         times = np.asarray(since_scan + self._robot.seconds(self._scan_begin_ns), dtype=np.float64)
         pose = self._robot.scenario.trajectory.at(times).pose
         c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
@@ -271,16 +277,18 @@ class RplidarDevice:
         seen = (distances >= self._lidar.min_range) & (distances <= self._lidar.max_range) & ~missing
         return directions, np.where(seen, distances, 0.0)
 
-    def _standard_nodes(self, directions: FloatArray, distances: FloatArray) -> bytes:
-        turn = 360.0 * self._lidar.rotation_hz * self._sample_ns * 1e-9
+    def _standard_nodes(self, first: int, directions: FloatArray, distances: FloatArray) -> bytes:
+        starts = np.diff(np.floor(self._turns(first - 1, len(directions) + 1))) > 0.0
         return b"".join(
             encode_standard_node(
                 int(direction * 64) % (360 * 64),
                 round(distance * 4000),
                 15 if distance else 0,
-                direction < turn,
+                start,
             )
-            for direction, distance in zip(directions.tolist(), distances.tolist(), strict=True)
+            for direction, distance, start in zip(
+                directions.tolist(), distances.tolist(), starts.tolist(), strict=True
+            )
         )
 
     def _express_capsules(self, directions: FloatArray, distances: FloatArray, is_first: bool) -> bytes:

@@ -8,6 +8,7 @@ from companion.sim.devices import Robot, make_devices
 from companion.sim.scenario import Scenario
 from drivers import make_sensor
 from drivers.framing import Sensor
+from estimators.messages import Scan
 
 START_NS = 1_000_000_000
 """Host's monotonic time at which a simulation begins; not 0, as no real one is."""
@@ -32,7 +33,7 @@ def converse(scenario: Scenario, sensors: Mapping[str, Sensor]) -> Iterator[RawC
         sensor.connected(START_NS)
     step, now_ns = 0, START_NS
     # A LiDAR that never scans would leave the robot waiting: the walk begins without it.
-    if "rplidar" not in {table.driver for table in scenario.config.sensor.values()}:
+    if not any(Scan in sensor.MEASURES for sensor in sensors.values()):
         robot.begin(now_ns)
     while not robot.arrived(now_ns):
         for name, device in devices.items():

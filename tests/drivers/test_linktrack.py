@@ -12,17 +12,8 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from drivers import make_sensor, sensor_config_class
-from drivers.linktrack import (
-    Frame,
-    LinkTrack,
-    NodeFrame2,
-    NodeFrame3,
-    NodeRange,
-    TagFrame0,
-    decode,
-    encode,
-    measurements,
-)
+from drivers.linktrack import LinkTrack, measurements
+from drivers.linktrack_frames import Frame, NodeFrame2, NodeFrame3, NodeRange, TagFrame0, decode, encode
 from estimators.messages import Attitude, ImuSample, RangeFrame
 
 DATA = Path(__file__).parents[1] / "data" / "linktrack"

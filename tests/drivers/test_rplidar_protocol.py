@@ -13,10 +13,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.framing import DecodeStats
+from drivers.rplidar_decoder import AnswerDecoder
 from drivers.rplidar_protocol import (
     AccBoardFlag,
     Answer,
-    AnswerDecoder,
     AnswerType,
     Command,
     DeviceInfo,

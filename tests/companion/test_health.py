@@ -1,0 +1,110 @@
+"""Health: what the pilot's autopilot gets, and what it does not."""
+
+import numpy as np
+import pytest
+
+from companion.config import HealthTable
+from companion.health import HealthMonitor, State
+from estimators.base import Report, Verdict
+from estimators.messages import FloatArray, PoseEstimate, PoseIncrement, RangeFrame
+
+SECOND = 1_000_000_000
+
+
+def pose(cov: FloatArray | None = None, x: float = 0.0) -> PoseEstimate:
+    T = np.eye(4)
+    T[0, 3] = x
+    return PoseEstimate(0, T, np.eye(6) * 0.01 if cov is None else cov, 0)
+
+
+def ranges(stamp_ns: int) -> RangeFrame:
+    return RangeFrame(stamp_ns, 1, np.arange(4), np.ones(4), np.ones(4), np.ones(4))
+
+
+def increment(stamp_ns: int) -> PoseIncrement:
+    return PoseIncrement(stamp_ns - 1, stamp_ns, np.zeros(3), np.eye(3), False)
+
+
+def monitor_at(
+    seconds: float, ranges_until: float = np.inf, increments_until: float = np.inf, good: int = 4
+) -> HealthMonitor:
+    """A monitor that has followed a run at 10 Hz."""
+    monitor = HealthMonitor(HealthTable.model_validate({}), has_ranges=True, has_scans=True)
+    verdicts = (Verdict.ACCEPTED,) * good + (Verdict.GATED,) * (4 - good)
+    for stamp_ns in range(0, round(seconds * SECOND) + 1, SECOND // 10):
+        if stamp_ns <= ranges_until * SECOND:
+            monitor.observe(ranges(stamp_ns), Report(verdicts))
+        if stamp_ns <= increments_until * SECOND:
+            monitor.observe(increment(stamp_ns), Report((Verdict.ACCEPTED,)))
+    return monitor
+
+
+def state(monitor: HealthMonitor, seconds: float, given: PoseEstimate | None) -> State:
+    return monitor.judge(given, round(seconds * SECOND)).state
+
+
+def test_all_well() -> None:
+    health = monitor_at(5.0).judge(pose(), 5 * SECOND)
+    assert (health.state, health.reason, health.sends) == (State.OK, "", True)
+
+
+def test_starting_until_there_is_a_pose_and_every_sensor_was_heard() -> None:
+    assert state(monitor_at(5.0), 5.0, None) is State.STARTING
+    assert state(monitor_at(0.5, increments_until=-1.0), 0.5, pose()) is State.STARTING
+
+
+@pytest.mark.parametrize(
+    ("ranges_until", "increments_until", "what"), [(3.0, 5.0, "range"), (5.0, 3.0, "LiDAR increment")]
+)
+def test_degraded_but_sent_while_one_sensor_is_missing(
+    ranges_until: float, increments_until: float, what: str
+) -> None:
+    monitor = monitor_at(5.0, ranges_until, increments_until)
+    health = monitor.judge(pose(), 5 * SECOND)
+    assert (health.state, health.sends) == (State.DEGRADED, True)
+    assert what in health.reason
+
+
+def test_a_sensor_that_never_speaks_is_degraded_after_a_while() -> None:
+    assert state(monitor_at(5.0, increments_until=-1.0), 5.0, pose()) is State.DEGRADED
+
+
+def test_lost_when_every_sensor_is_missing() -> None:
+    assert state(monitor_at(5.0, ranges_until=2.0, increments_until=2.0), 5.0, pose()) is State.LOST
+
+
+def test_lost_while_ranges_disagree_with_the_pose_and_back_when_they_agree() -> None:
+    monitor = monitor_at(20.0, good=0, ranges_until=20.0)
+    assert state(monitor, 20.0, pose()) is State.LOST
+    for stamp_ns in range(20 * SECOND, 30 * SECOND, SECOND // 10):
+        monitor.observe(ranges(stamp_ns), Report((Verdict.ACCEPTED,) * 4))
+        monitor.observe(increment(stamp_ns), Report((Verdict.ACCEPTED,)))
+    assert state(monitor, 30.0, pose()) is State.OK
+
+
+def test_a_few_blocked_anchors_are_no_alarm() -> None:
+    assert state(monitor_at(20.0, good=2), 20.0, pose()) is State.OK
+
+
+def test_lost_when_the_covariance_says_so() -> None:
+    wide = np.eye(6) * 0.01
+    wide[0, 0] = wide[1, 1] = wide[0, 1] = wide[1, 0] = 0.2
+    wide[0, 0] = 0.3
+    assert state(monitor_at(5.0), 5.0, pose(wide)) is State.LOST
+    turned = np.eye(6) * 0.01
+    turned[5, 5] = np.deg2rad(21.0) ** 2
+    assert state(monitor_at(5.0), 5.0, pose(turned)) is State.LOST
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_nothing_that_is_not_finite_is_sent(bad: float) -> None:
+    cov = np.eye(6) * 0.01
+    cov[2, 2] = bad
+    assert state(monitor_at(5.0), 5.0, pose(cov)) is State.LOST
+    assert state(monitor_at(5.0), 5.0, pose(x=bad)) is State.LOST
+
+
+def test_a_covariance_that_is_none_is_not_sent() -> None:
+    cov = np.eye(6) * 0.01
+    cov[0, 1] = cov[1, 0] = 0.02
+    assert state(monitor_at(5.0), 5.0, pose(cov)) is State.LOST
