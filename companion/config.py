@@ -66,7 +66,10 @@ class StartTable(Table):
     y: Coordinate
     yaw_deg: float = Field(ge=-360, le=360)
     sigma_xy: float = Field(0.10, gt=0, le=100, description="[m], each axis")
-    sigma_yaw_deg: float = Field(5.0, gt=0, le=180)
+    sigma_yaw_deg: float = Field(5.0, gt=0, le=180, description="[deg]")
+    still_for: float = Field(
+        5.0, ge=0, le=600, description="it stands there until LiDAR odometry begins, at most so long [s]"
+    )
 
 
 class SensorTable(Table):
@@ -192,6 +195,7 @@ class Config(Table):
             start=Start(
                 pose=np.array([start.x, start.y, np.deg2rad(start.yaw_deg)]),
                 sigma=np.array([start.sigma_xy, start.sigma_xy, yaw_sigma]),
+                still_for=start.still_for,
             ),
             height=body.height,
             height_sigma=body.height_sigma,
@@ -240,7 +244,7 @@ def default_toml() -> str:
     full = Config.model_validate({"anchors": anchors, "start": start, "sensor": sensors})
     data = full.model_dump(mode="json", serialize_as_any=True)
     del data["anchors"], data["sensor"]
-    data["start"] = {k: v for k, v in data["start"].items() if k.startswith("sigma")}
+    data["start"] = {k: v for k, v in data["start"].items() if k not in start}
     return tomli_w.dumps(_toml_ready(data))
 
 

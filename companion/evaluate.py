@@ -90,11 +90,15 @@ class Reference:
     def __init__(self, truths: Sequence[Truth]) -> None:
         self._stamps_ns = np.array([truth.stamp_ns for truth in truths], dtype=np.int64)
         poses = np.array([truth.pose for truth in truths]).reshape(-1, 3)
-        self._xy, self._yaw = poses[:, :2], np.unwrap(poses[:, 2])
+        self._xy, self._yaw = poses[:, :2], poses[:, 2].copy()
+        known = np.isfinite(self._yaw)
+        self._yaw[known] = np.unwrap(self._yaw[known])
 
     def covers(self, stamp_ns: int) -> bool:
         """Whether truth is known at a time."""
-        return bool(len(self._stamps_ns)) and self._stamps_ns[0] <= stamp_ns <= self._stamps_ns[-1]
+        if len(self._stamps_ns) == 0:
+            return False
+        return bool(self._stamps_ns[0] <= stamp_ns <= self._stamps_ns[-1])
 
     def at(self, stamps_ns: Sequence[int]) -> FloatArray:
         """Poses (N, 3) by linear interpolation; the yaw may exceed a full turn."""

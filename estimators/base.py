@@ -15,6 +15,8 @@ class Verdict(StrEnum):
     ACCEPTED = "accepted"
     GATED = "gated"
     """Too far from the prediction (NIS above the gate)."""
+    SUSPECT = "suspect"
+    """Near the prediction, but its anchor was gated a moment ago: it may still be blocked."""
     UNKNOWN_ANCHOR = "unknown anchor"
     """The site file has no anchor with this id."""
     IMPOSSIBLE = "impossible"
@@ -54,10 +56,12 @@ class Start:
     Attributes:
         pose: (3,) x [m], y [m], yaw [rad] of the body in the map.
         sigma: (3,) standard deviations of the same.
+        still_for: the robot stands there until odometry begins, at most this long [s].
     """
 
     pose: FloatArray
     sigma: FloatArray
+    still_for: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)

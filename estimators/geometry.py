@@ -4,7 +4,7 @@
 Conventions follow the README's frame table: right-handed, z up, angles counter-clockwise.
 """
 
-from math import cos, pi, sin
+from math import cos, remainder, sin, tau
 
 import numpy as np
 
@@ -12,8 +12,8 @@ from estimators.messages import FloatArray
 
 
 def wrap_angle(angle: float) -> float:
-    """Angle [rad] brought into [-pi, pi)."""
-    return (angle + pi) % (2.0 * pi) - pi
+    """Angle [rad] brought into [-pi, pi]."""
+    return remainder(angle, tau)
 
 
 def rotation(yaw: float) -> FloatArray:
@@ -45,6 +45,47 @@ def inverse(T_a_b: FloatArray) -> FloatArray:
 def between(T_w_a: FloatArray, T_w_b: FloatArray) -> FloatArray:
     """`T_a_b`: pose b seen from pose a, (3,)."""
     return compose(inverse(T_w_a), T_w_b)
+
+
+def exponential(twist: FloatArray) -> FloatArray:
+    """Motion of a body that keeps a velocity in its own frame for one second.
+
+    Args:
+        twist: (3,) forward, left [m/s], counter-clockwise [rad/s].
+
+    Returns:
+        (3,) pose at the end, seen from the beginning.
+
+    Source: Sola et al., A micro Lie theory for state estimation in robotics, Eq. (156)-(158).
+    """
+    along, across = _arc(twist[2])
+    return np.array(
+        [
+            along * twist[0] - across * twist[1],
+            across * twist[0] + along * twist[1],
+            wrap_angle(twist[2]),
+        ]
+    )
+
+
+def logarithm(T_a_b: FloatArray) -> FloatArray:
+    """Velocity that `exponential` turns into this motion, (3,), turning by less than half a turn."""
+    along, across = _arc(T_a_b[2])
+    scale = 1.0 / (along * along + across * across)
+    return np.array(
+        [
+            scale * (along * T_a_b[0] + across * T_a_b[1]),
+            scale * (along * T_a_b[1] - across * T_a_b[0]),
+            T_a_b[2],
+        ]
+    )
+
+
+def _arc(yaw: float) -> tuple[float, float]:
+    """Chord of an arc of unit length, along and across its first direction."""
+    if abs(yaw) < 1e-6:
+        return 1.0, yaw / 2.0
+    return sin(yaw) / yaw, (1.0 - cos(yaw)) / yaw
 
 
 def transform(T_a_b: FloatArray, points_b: FloatArray) -> FloatArray:

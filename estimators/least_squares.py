@@ -38,14 +38,16 @@ class LeastSquares:
     def reset(self) -> None:
         """Forget the last fix."""
         self._fix: Fix | None = None
-        self._stamp_ns = 0
+        self._fix_ns = 0
+        self._newest_ns: int | None = None
 
     def update(self, measurement: Measurement) -> Report:
         """Solve a RangeFrame; other measurements are not used."""
         if not isinstance(measurement, RangeFrame):
             return Report((Verdict.NOT_USED,))
-        if self._fix is not None and measurement.stamp_ns < self._stamp_ns:
+        if self._newest_ns is not None and measurement.stamp_ns < self._newest_ns:
             return Report((Verdict.LATE,) * len(measurement.ranges))
+        self._newest_ns = measurement.stamp_ns
         verdicts: list[Verdict] = []
         used: list[int] = []
         rows: list[tuple[FloatArray, float, float]] = []
@@ -76,12 +78,12 @@ class LeastSquares:
             return Report(tuple(verdicts), residuals, residuals)
         residuals[used] = fix.residuals
         self._fix = fix
-        self._stamp_ns = measurement.stamp_ns
+        self._fix_ns = measurement.stamp_ns
         return Report(tuple(verdicts), residuals, np.full(len(verdicts), np.nan))
 
     def pose_at(self, stamp_ns: int) -> PoseEstimate | None:
         """The last fix, held; its covariance grows with its age. Yaw variance is infinite."""
-        age = abs(stamp_ns - self._stamp_ns) * 1e-9
+        age = abs(stamp_ns - self._fix_ns) * 1e-9
         if self._fix is None or age > self._config.max_age:
             return None
         planar = np.zeros((3, 3))

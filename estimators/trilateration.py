@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import least_squares
 
 from estimators.messages import FloatArray
 
@@ -54,8 +55,8 @@ def check_anchor_geometry(anchors: FloatArray) -> None:
 def trilaterate(anchors: FloatArray, ranges: FloatArray, sigmas: FloatArray) -> Fix:
     """Weighted least-squares position from horizontal ranges.
 
-    The closed form (differences of squared ranges, linear in x and y) starts a Gauss-Newton iteration
-    on the ranges themselves.
+    The closed form (differences of squared ranges, linear in x and y) starts a Levenberg-Marquardt
+    iteration (MINPACK) on the ranges themselves.
 
     Args:
         anchors: (N, 2) anchor positions [m].
@@ -68,18 +69,24 @@ def trilaterate(anchors: FloatArray, ranges: FloatArray, sigmas: FloatArray) -> 
     Source: huang2024 Eq. (4), generalised to N anchors.
     """
     check_anchor_geometry(anchors)
-    position = _closed_form(anchors, ranges)
-    for _ in range(20):
+
+    def offsets(position: FloatArray) -> tuple[FloatArray, FloatArray]:
         offset = position - anchors
-        distance = np.maximum(np.linalg.norm(offset, axis=1), 1e-9)
-        jacobian = offset / distance[:, None] / sigmas[:, None]
-        information = jacobian.T @ jacobian
-        step = np.linalg.solve(information + 1e-12 * np.eye(2), jacobian.T @ ((ranges - distance) / sigmas))
-        position = position + step
-        if float(np.abs(step).max()) < 1e-6:
-            break
-    residuals = ranges - np.linalg.norm(position - anchors, axis=1)
-    return Fix(position, np.linalg.inv(information + 1e-12 * np.eye(2)), residuals)
+        distance: FloatArray = np.maximum(np.linalg.norm(offset, axis=1), 1e-9)
+        return offset, distance
+
+    def residuals(position: FloatArray) -> FloatArray:
+        return (offsets(position)[1] - ranges) / sigmas
+
+    def jacobian(position: FloatArray) -> FloatArray:
+        offset, distance = offsets(position)
+        return offset / (distance * sigmas)[:, None]
+
+    found = least_squares(residuals, _closed_form(anchors, ranges), jacobian, method="lm", xtol=1e-10)
+    position = np.asarray(found.x, dtype=np.float64)
+    information = jacobian(position).T @ jacobian(position)
+    cov = np.asarray(np.linalg.inv(information), dtype=np.float64)
+    return Fix(position, cov, -residuals(position) * sigmas)
 
 
 def _closed_form(anchors: FloatArray, ranges: FloatArray) -> FloatArray:

@@ -78,11 +78,12 @@ def range_frames(draw: st.DrawFn, stamp_ns: int) -> RangeFrame:
 @st.composite
 def pose_increments(draw: st.DrawFn, stamp_ns: int, reference_stamps: list[int]) -> PoseIncrement:
     """Increments from known and unknown keyframes, possible, jumping or not numbers at all."""
-    component = st.one_of(st.floats(-0.3, 0.3), st.floats(-1e6, 1e6), st.just(NAN))
+    component = st.one_of(st.floats(-0.3, 0.3), st.floats(-1e6, 1e6), st.sampled_from([NAN, INF]))
     factor = np.array(draw(st.lists(st.floats(-0.1, 0.1), min_size=9, max_size=9))).reshape(3, 3)
     cov: FloatArray = factor @ factor.T + draw(st.sampled_from([1e-10, 1e-6, 1e-2, 1e4])) * np.eye(3)
+    cov *= draw(st.sampled_from([1.0, 1.0, 0.0, -1.0]))
     if draw(st.booleans()):
-        cov[draw(st.integers(0, 2)), draw(st.integers(0, 2))] = NAN
+        cov[draw(st.integers(0, 2)), draw(st.integers(0, 2))] = draw(st.sampled_from([NAN, INF, -1.0]))
     return PoseIncrement(
         draw(st.sampled_from([stamp_ns, stamp_ns - 7, *reference_stamps])),
         stamp_ns,

@@ -19,7 +19,7 @@ POSE = slice(0, 3)
 MOVING = slice(0, 6)
 REFERENCE = slice(6, 9)
 START_SPEED_SIGMA = 0.3
-"""The robot stands or starts slowly: standard deviation of each velocity at the start [m/s, rad/s]."""
+"""Standard deviation of each velocity when the robot sets off [m/s, rad/s]."""
 
 
 class LidarOdometry:
@@ -37,10 +37,17 @@ class LidarOdometry:
             0.99999, gt=0.5, lt=1, description="share of good increments that pass the NIS gate"
         )
         accel_noise: float = Field(
-            0.8, gt=0, le=100, description="density of white acceleration [m/s^2/sqrt(Hz)]"
+            0.5,
+            gt=0,
+            le=100,
+            description="density of white acceleration [m/s^2/sqrt(Hz)]: about the robot's acceleration "
+            "times the square root of how long it lasts",
         )
         yaw_accel_noise: float = Field(
-            2.0, gt=0, le=100, description="density of white angular acceleration [rad/s^2/sqrt(Hz)]"
+            1.5,
+            gt=0,
+            le=100,
+            description="density of white angular acceleration [rad/s^2/sqrt(Hz)], likewise",
         )
 
     def __init__(self, config: Config, setup: Setup) -> None:
@@ -54,8 +61,10 @@ class LidarOdometry:
         start = self._setup.start
         self._filter = ExtendedKalmanFilter(dim_x=9, dim_z=3)
         self._filter.x = np.concatenate([start.pose, np.zeros(3), start.pose])
-        sigma = np.concatenate([start.sigma, np.full(3, START_SPEED_SIGMA), start.sigma])
+        sigma = np.concatenate([start.sigma, np.zeros(3), start.sigma])
         self._filter.P = np.diag(sigma**2)
+        self._stands_until_ns: int | None = None
+        self._stands = True
         self._stamp_ns: int | None = None
         self._reference_stamp_ns: int | None = None
 
@@ -67,7 +76,7 @@ class LidarOdometry:
     def update(self, measurement: Measurement) -> Report:
         """Predict to an increment's time and take it; other measurements are not used."""
         if isinstance(measurement, PoseIncrement):
-            if not self._predict_to(measurement.stamp_ns):
+            if self._is_late(measurement.stamp_ns):
                 return Report((Verdict.LATE,))
             report = self._update_increment(measurement)
             if measurement.is_keyframe:
@@ -80,7 +89,7 @@ class LidarOdometry:
         """Pose predicted with constant velocity; None before the first measurement."""
         if self._stamp_ns is None:
             return None
-        F, Q = self._motion((stamp_ns - self._stamp_ns) * 1e-9)
+        F, Q = self._motion(0.0 if self._stands else (stamp_ns - self._stamp_ns) * 1e-9)
         mean = F @ self._filter.x[MOVING]
         cov = (F @ self._filter.P[MOVING, MOVING] @ F.T + Q)[POSE, POSE]
         T_map_body = lift(mean[POSE], self._setup.height)
@@ -89,23 +98,39 @@ class LidarOdometry:
     def _motion(self, dt: float) -> tuple[FloatArray, FloatArray]:
         return constant_velocity(dt, *self._noise)
 
-    def _predict_to(self, stamp_ns: int) -> bool:
-        if self._stamp_ns is not None:
-            dt = (stamp_ns - self._stamp_ns) * 1e-9
-            if dt < 0.0:
-                return False
+    def _set_off(self) -> None:
+        """From here on the robot may move: a start heading that is held until now must not fade before."""
+        if self._stands:
+            self._stands = False
+            self._filter.P[3:6, 3:6] = np.eye(3) * START_SPEED_SIGMA**2
+
+    def _is_late(self, stamp_ns: int) -> bool:
+        return self._stamp_ns is not None and stamp_ns < self._stamp_ns
+
+    def _predict_to(self, stamp_ns: int) -> None:
+        if self._stamp_ns is None or self._stands_until_ns is None:
+            self._stamp_ns = stamp_ns
+            self._stands_until_ns = stamp_ns + round(self._setup.start.still_for * 1e9)
+        if stamp_ns > self._stands_until_ns:
+            self._set_off()
+        if not self._stands:
             F, Q = np.eye(9), np.zeros((9, 9))
-            F[MOVING, MOVING], Q[MOVING, MOVING] = self._motion(dt)
+            F[MOVING, MOVING], Q[MOVING, MOVING] = self._motion((stamp_ns - self._stamp_ns) * 1e-9)
             self._filter.F, self._filter.Q = F, Q
             self._filter.predict()
         self._stamp_ns = stamp_ns
-        return True
 
     def _update_increment(self, measured: PoseIncrement) -> Report:
-        if measured.from_stamp_ns == measured.stamp_ns:
+        founds = measured.from_stamp_ns == measured.stamp_ns
+        has_reference = measured.from_stamp_ns == self._reference_stamp_ns
+        is_possible = bool(np.isfinite(measured.increment).all()) and _is_covariance(measured.cov)
+        if has_reference and is_possible and not founds:
+            self._set_off()
+        self._predict_to(measured.stamp_ns)
+        if founds:
             return Report((Verdict.ACCEPTED,))
-        if measured.from_stamp_ns != self._reference_stamp_ns:
-            return Report((Verdict.NO_REFERENCE,))
+        if not (has_reference and is_possible):
+            return Report((Verdict.NO_REFERENCE if is_possible else Verdict.IMPOSSIBLE,))
         predicted, by_reference, by_pose = increment(self._filter.x[REFERENCE], self._filter.x[POSE])
         H = np.zeros((3, 9))
         H[:, POSE], H[:, REFERENCE] = by_pose, by_reference
@@ -113,8 +138,7 @@ class LidarOdometry:
         S = H @ self._filter.P @ H.T + measured.cov
         nis = float(innovation @ np.linalg.solve(S, innovation))
         report = np.full(1, np.nan), np.array([nis])
-        # A NaN compares false with everything, so ask for what must hold, not for what must not.
-        if not nis <= self._increment_gate:
+        if nis > self._increment_gate:
             return Report((Verdict.GATED,), *report)
         self._correct(measured.increment, H, predicted, measured.cov)
         return Report((Verdict.ACCEPTED,), *report)
@@ -133,6 +157,11 @@ class LidarOdometry:
         self._filter.x = copy @ self._filter.x
         self._filter.P = copy @ self._filter.P @ copy.T
         self._reference_stamp_ns = stamp_ns
+
+
+def _is_covariance(cov: FloatArray) -> bool:
+    """Whether a matrix is finite and positive definite."""
+    return bool(np.isfinite(cov).all() and np.linalg.eigvalsh(cov)[0] > 0.0)
 
 
 def _increment_residual(measured: FloatArray, predicted: FloatArray) -> FloatArray:

@@ -24,10 +24,8 @@ def reduce_height(slant: float, sigma: float, height_difference: float) -> tuple
 
     Source: huang2024 Eq. (3); sigma by first-order propagation, ``sigma_r = sigma_d d / r``.
     """
-    if not isfinite(slant):
-        return None
     square = slant * slant - height_difference * height_difference
-    if slant <= 0.0 or square < MIN_HORIZONTAL_RANGE**2:
+    if not isfinite(square) or slant <= 0.0 or square < MIN_HORIZONTAL_RANGE**2:
         return None
     horizontal = sqrt(square)
     return horizontal, sigma * slant / horizontal

@@ -1,0 +1,247 @@
+"""The Rerun recording of a replay, read back from its file."""
+
+import resource
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rerun.chunk import RrdReader
+
+from companion.config import Config
+from companion.errors import UserError
+from companion.log import Log, Truth
+from companion.pipeline import Tick
+from companion.replay import config_of, replay
+from companion.rerun_view import RerunView
+from companion.sim.world import World
+from estimators.base import Verdict
+from estimators.messages import FloatArray, RangeFrame, Scan
+
+NAMES = ["ekf", "least_squares", "lidar_odometry"]
+GREEN, VERMILION, GREY = 0x009E73FF, 0xD55E00FF, 0x787878FF
+Recording = dict[str, dict[str, Any]]
+
+
+class Run:
+    """The ticks of a short replay, to be shown again and again."""
+
+    def __init__(self, path: Path) -> None:
+        log = Log(path)
+        self.config = config_of(log, [])
+        self.ticks: list[tuple[Tick, Truth | None]] = []
+        replay(log, self.config, NAMES, lambda tick, truth: self.ticks.append((tick, truth)))
+
+    def measurements(self, kind: type[RangeFrame] | type[Scan]) -> list[Any]:
+        outcomes = [outcome for tick, _ in self.ticks for outcome in tick.outcomes]
+        return [outcome.measurement for outcome in outcomes if isinstance(outcome.measurement, kind)]
+
+    def verdicts(self, name: str) -> list[Verdict]:
+        outcomes = [outcome for tick, _ in self.ticks for outcome in tick.outcomes]
+        reports = [o.reports[name] for o in outcomes if isinstance(o.measurement, RangeFrame)]
+        return [verdict for report in reports for verdict in report.verdicts]
+
+    def show(
+        self,
+        path: Path,
+        primary: str = "ekf",
+        change: Callable[[int, Tick, Truth | None], tuple[Tick, Truth | None]] = lambda _, *both: both,
+    ) -> Recording:
+        view = RerunView(self.config, primary, path)
+        for i, (tick, truth) in enumerate(self.ticks):
+            view.tick(*change(i, tick, truth))
+        view.close()
+        return read(path)
+
+
+def read(path: Path) -> Recording:
+    """Entity -> component -> rows; a static component has one row."""
+    entities: Recording = {}
+    for chunk in RrdReader(path).stream().to_chunks():
+        columns = chunk.to_record_batch().to_pydict()
+        entities.setdefault(chunk.entity_path.removeprefix("/"), {}).update(columns)
+    return entities
+
+
+@pytest.fixture(scope="module")
+def run(short_log: Path) -> Run:
+    return Run(short_log)
+
+
+@pytest.fixture(scope="module")
+def recording(run: Run, tmp_path_factory: pytest.TempPathFactory) -> Recording:
+    return run.show(tmp_path_factory.mktemp("view") / "new folder" / "run.rrd")
+
+
+def test_every_tick_has_a_row_for_every_estimator(run: Run, recording: Recording) -> None:
+    for name in NAMES:
+        rows = recording[f"map/estimate/{name}/position"]["Points2D:positions"]
+        poses = [tick.poses[name] for tick, _ in run.ticks]
+        assert [len(row) for row in rows] == [int(pose is not None) for pose in poses]
+        shown = np.array([row[0] for row in rows if row])
+        assert shown == pytest.approx(np.array([pose.xy for pose in poses if pose is not None]), abs=1e-5)
+
+
+def test_time_begins_with_the_log(run: Run, recording: Recording) -> None:
+    times = [time.total_seconds() for time in recording["map/estimate/ekf/position"]["time"]]
+    assert times[0] == 0.0
+    assert times[-1] == pytest.approx((run.ticks[-1][0].stamp_ns - run.ticks[0][0].stamp_ns) * 1e-9, abs=1e-6)
+
+
+def test_map_holds_map_coordinates_and_only_its_transform_is_mirrored(run: Run, recording: Recording) -> None:
+    assert recording["map"]["Transform3D:scale"] == [[[1.0, -1.0, 1.0]]]
+    assert recording["map/anchors"]["Points2D:labels"] == [["A0", "A1", "A2", "A3"]]
+    (anchors,) = recording["map/anchors"]["Points2D:positions"]
+    assert np.array(anchors) == pytest.approx(np.array([a[:2] for a in run.config.anchors.values()]))
+    (walls,) = recording["map/walls"]["LineStrips2D:strips"]
+    assert np.array(walls) == pytest.approx(np.array(run.config.site.walls))
+    truths = {truth.stamp_ns: truth.pose[:2] for _, truth in run.ticks if truth is not None}
+    shown = np.array([row[0] for row in recording["map/truth/position"]["Points2D:positions"]])
+    assert shown == pytest.approx(np.array(list(truths.values())), abs=1e-5)
+
+
+def test_scans_lie_on_the_walls(run: Run, recording: Recording) -> None:
+    rows = recording["map/scan"]["Points2D:positions"]
+    assert len(rows) == len(run.measurements(Scan))
+    points = np.array([point for row in rows for point in row])
+    assert len(points) > 10_000
+    world = World([list(wall) for wall in run.config.site.walls], [(4.0, 3.6, 0.6, 0.6, 0.0, 3.0)])
+    distances = np.min([distance_to(points, segment) for segment in world.segments], axis=0)
+    assert np.median(distances) < 0.05
+    assert np.percentile(distances, 95) < 0.2
+
+
+def distance_to(points: FloatArray, segment: FloatArray) -> FloatArray:
+    start, along = segment[:2], segment[2:] - segment[:2]
+    share = np.clip((points - start) @ along / (along @ along), 0.0, 1.0)
+    distances: FloatArray = np.linalg.norm(points - start - share[:, None] * along, axis=1)
+    return distances
+
+
+def test_ranges_go_from_tag_to_anchor_in_the_colour_of_their_verdict(run: Run, recording: Recording) -> None:
+    frames = run.measurements(RangeFrame)
+    assert len(recording["map/ranges"]["LineStrips2D:strips"]) == len(frames)
+    colours = [colour for row in recording["map/ranges"]["LineStrips2D:colors"] for colour in row]
+    verdicts = run.verdicts("ekf")
+    # The first frames come before the first pose: there is no tag yet to draw them from.
+    hidden = len(verdicts) - len(colours)
+    assert 0 < hidden < 20
+    expected = {Verdict.ACCEPTED: GREEN, Verdict.GATED: VERMILION}
+    assert colours == [expected[verdict] for verdict in verdicts[hidden:]]
+    assert set(colours) == {GREEN, VERMILION}
+
+    ends = np.array([strip[1] for row in recording["map/ranges"]["LineStrips2D:strips"] for strip in row])
+    anchors = np.array(list(run.config.anchors.values()))[:, :2]
+    assert np.linalg.norm(ends[:, None] - anchors, axis=2).min(axis=1).max() < 1e-5
+
+
+def test_plots_hold_errors_residuals_nis_and_gate(run: Run, recording: Recording) -> None:
+    for entity in ("error/position/ekf", "error/position/sigma", "error/yaw/lidar_odometry"):
+        assert len(recording[entity]["Scalars:scalars"]) == len(run.ticks)
+    errors = np.array(recording["error/position/ekf"]["Scalars:scalars"])
+    assert 0.0 < np.nanmax(errors) < 0.5
+    assert "error/yaw/least_squares" not in recording  # it has no heading
+    for anchor in run.config.anchors:
+        assert len(recording[f"ranges/residual/A{anchor}"]["Scalars:scalars"]) > 100
+    ((gate,), _) = recording["ranges/nis/gate"]["Scalars:scalars"]
+    nis = [v for i in run.config.anchors for (v,) in recording[f"ranges/nis/A{i}"]["Scalars:scalars"]]
+    accepted = sum(verdict is Verdict.ACCEPTED for verdict in run.verdicts("ekf"))
+    assert sum(value <= gate for value in nis) == accepted
+
+
+def test_health_changes_are_a_state_and_a_line_of_text(run: Run, recording: Recording) -> None:
+    states = [tick.health.state for tick, _ in run.ticks]
+    changes = [b for a, b in zip([None, *states], states, strict=False) if a is not b]
+    assert [state for (state,) in recording["health/state"]["StateChange:state"]] == changes
+    assert [text.split(":")[0] for (text,) in recording["health/log"]["TextLog:text"]] == changes
+
+
+def test_the_file_says_how_it_opens(run: Run, tmp_path: Path) -> None:
+    run.show(tmp_path / "run.rrd")
+    assert len(RrdReader(tmp_path / "run.rrd").blueprints()) == 1
+
+
+def test_missing_and_nan_poses_leave_gaps(run: Run, tmp_path: Path) -> None:
+    def spoil(i: int, tick: Tick, truth: Truth | None) -> tuple[Tick, Truth | None]:
+        pose = tick.poses["ekf"]
+        if 100 <= i < 120:
+            pose = None
+        elif 150 <= i < 160:
+            assert pose is not None
+            pose = replace(pose, T_map_body=np.full((4, 4), np.nan))
+        elif 200 <= i < 210:
+            assert pose is not None
+            pose = replace(pose, cov=np.full((6, 6), np.inf))
+        return replace(tick, poses={**tick.poses, "ekf": pose}), truth
+
+    recording = run.show(tmp_path / "run.rrd", change=spoil)
+    shown = [len(row) for row in recording["map/estimate/ekf/position"]["Points2D:positions"]]
+    assert sum(shown[100:120]) == sum(shown[150:160]) == 0
+    assert sum(shown[200:210]) == 10
+    assert (
+        sum(len(row) for row in recording["map/estimate/ekf/ellipse_95"]["LineStrips2D:strips"][200:210]) == 0
+    )
+    (pieces,) = recording["map/estimate/ekf/track"]["LineStrips2D:strips"]
+    assert len(pieces) == 3
+    errors = np.array(recording["error/position/ekf"]["Scalars:scalars"])[:, 0]
+    assert np.isnan(errors[100:120]).all()
+
+
+def test_without_truth_there_are_no_errors(run: Run, tmp_path: Path) -> None:
+    recording = run.show(tmp_path / "run.rrd", change=lambda _, tick, __: (tick, None))
+    assert "map/truth/track" not in recording
+    assert "error/position/ekf" not in recording
+    assert len(recording["error/position/sigma"]["Scalars:scalars"]) == len(run.ticks)
+
+
+def test_truth_without_heading_gives_errors_in_position_only(run: Run, tmp_path: Path) -> None:
+    def blind(_: int, tick: Tick, truth: Truth | None) -> tuple[Tick, Truth | None]:
+        return tick, truth and replace(truth, pose=np.array([*truth.pose[:2], np.nan]))
+
+    recording = run.show(tmp_path / "run.rrd", change=blind)
+    assert "error/position/ekf" in recording
+    assert "error/yaw/ekf" not in recording
+
+
+@pytest.mark.parametrize("primary", ["least_squares", "lidar_odometry"])
+def test_estimators_without_heading_or_ranges_can_be_primary(run: Run, tmp_path: Path, primary: str) -> None:
+    recording = run.show(tmp_path / "run.rrd", primary)
+    colours = {colour for row in recording["map/ranges"]["LineStrips2D:colors"] for colour in row}
+    if primary == "least_squares":
+        assert sum(len(row) for row in recording["map/scan"]["Points2D:positions"]) == 0
+        assert GREEN in colours
+    else:
+        assert colours == {GREY}
+        assert "Scalars:scalars" not in recording["ranges/residual/A0"]
+
+
+def test_a_run_of_no_ticks_is_an_empty_map(config: Config, tmp_path: Path) -> None:
+    RerunView(config, "ekf", tmp_path / "run.rrd").close()
+    assert "map/walls" in read(tmp_path / "run.rrd")
+
+
+def test_a_file_that_cannot_be_written_is_the_users_error(config: Config, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UserError, match=r"cannot write the view .*run\.rrd: File exists"):
+        RerunView(config, "ekf", tmp_path / "file" / "run.rrd")
+    with pytest.raises(UserError, match="Is a directory"):
+        RerunView(config, "ekf", tmp_path)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="needs /dev/full and a limit on the size of files")
+def test_a_full_disk_is_the_users_error(run: Run, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=r"cannot write the view /dev/full: .*No space left on device"):
+        RerunView(run.config, "ekf", Path("/dev/full"))
+    view = RerunView(run.config, "ekf", tmp_path / "run.rrd")
+    for tick, truth in run.ticks:
+        view.tick(tick, truth)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, limits[1]))
+    try:
+        with pytest.raises(UserError, match=r"cannot write the view .*run\.rrd: File-writer"):
+            view.close()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)

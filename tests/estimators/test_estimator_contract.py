@@ -1,0 +1,242 @@
+"""What every estimator promises, over the whole table: bad data gets a verdict and harms nothing."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from estimators import ESTIMATORS, estimator_config_class, make_estimator
+from estimators.base import Estimator, Report, Verdict
+from estimators.messages import (
+    Attitude,
+    ImuSample,
+    Measurement,
+    PoseEstimate,
+    PoseIncrement,
+    RangeFrame,
+    Scan,
+    measurement_stamp_ns,
+)
+from tests.strategies import HOUR_NS, SETUP, hostile_streams, range_frame
+
+EVERY_ESTIMATOR = pytest.mark.parametrize("name", sorted(ESTIMATORS))
+LONG = settings(deadline=None, max_examples=50)
+
+SECOND_NS = 10**9
+SMALL_COV = np.diag([1e-4, 1e-4, 1e-5])
+
+
+def make(name: str) -> Estimator:
+    """Estimator with its defaults."""
+    return make_estimator(name, estimator_config_class(name)(), SETUP)
+
+
+def good_ranges(stamp_ns: int) -> RangeFrame:
+    """Exact ranges of a robot that stands at the start."""
+    x, y, yaw = SETUP.start.pose
+    c, s = np.cos(yaw), np.sin(yaw)
+    arm = SETUP.tag_in_body
+    tag = np.array([x + c * arm[0] - s * arm[1], y + s * arm[0] + c * arm[1], SETUP.height + arm[2]])
+    slants = [float(np.linalg.norm(anchor - tag)) for anchor in SETUP.anchors.values()]
+    return range_frame(stamp_ns, list(SETUP.anchors), slants)
+
+
+def standing_robot() -> list[Measurement]:
+    """Two seconds of a robot that stands at the start: ranges, increments, a keyframe every second."""
+    stream: list[Measurement] = []
+    for k in range(21):
+        stamp_ns = k * SECOND_NS // 10
+        from_stamp_ns = (k - 1) // 10 * SECOND_NS if k else 0
+        stream += [
+            good_ranges(stamp_ns),
+            PoseIncrement(from_stamp_ns, stamp_ns, np.zeros(3), SMALL_COV, k % 10 == 0),
+        ]
+    return stream
+
+
+def started(name: str) -> Estimator:
+    """Estimator that has seen the standing robot."""
+    estimator = make(name)
+    for measurement in standing_robot():
+        estimator.update(measurement)
+    return estimator
+
+
+def written(pose: PoseEstimate | None) -> tuple[int, bytes, bytes, int] | None:
+    """All of a pose, to the last bit."""
+    if pose is None:
+        return None
+    return pose.stamp_ns, pose.T_map_body.tobytes(), pose.cov.tobytes(), pose.reset_counter
+
+
+def run(estimator: Estimator, stream: list[Measurement]) -> list[object]:
+    """Everything an estimator says of a stream, to the last bit."""
+    said: list[object] = []
+    for measurement in stream:
+        report = estimator.update(measurement)
+        pose = estimator.pose_at(measurement_stamp_ns(measurement))
+        said.append((report.verdicts, report.residuals.tobytes(), report.nis.tobytes(), written(pose)))
+    return said
+
+
+def assert_report_fits(report: Report, measurement: Measurement) -> None:
+    """One verdict a range, else one; residuals and NIS one a verdict or none at all."""
+    expected = len(measurement.ranges) if isinstance(measurement, RangeFrame) else 1
+    assert len(report.verdicts) == expected
+    assert len(report.residuals) in {0, expected}
+    assert len(report.nis) in {0, expected}
+
+
+def assert_pose_is_sound(pose: PoseEstimate, stamp_ns: int) -> None:
+    """Right stamp, a rigid transform, a symmetric covariance without NaN, semidefinite where finite."""
+    assert pose.stamp_ns == stamp_ns
+    R = pose.T_map_body[:3, :3]
+    assert np.isfinite(pose.T_map_body).all()
+    np.testing.assert_allclose(R.T @ R, np.eye(3), atol=1e-9)
+    np.testing.assert_array_equal(pose.T_map_body[3], [0.0, 0.0, 0.0, 1.0])
+    assert not np.isnan(pose.cov).any()
+    known = np.isfinite(np.diag(pose.cov))
+    # What is not known is so on the diagonal alone, and positively.
+    assert (np.diag(pose.cov)[~known] > 0.0).all()
+    cov = pose.cov[np.ix_(known, known)]
+    values = np.linalg.eigvalsh(cov)
+    np.testing.assert_allclose(cov, cov.T, atol=1e-12 * values[-1])
+    assert values[0] >= -1e-9 * values[-1]
+
+
+@EVERY_ESTIMATOR
+@LONG
+@given(stream=hostile_streams(), ahead=st.sampled_from([0, 1, 33_000_000, SECOND_NS, -33_000_000, HOUR_NS]))
+def test_hostile_streams_get_verdicts_and_sound_poses(
+    name: str, stream: list[Measurement], ahead: int
+) -> None:
+    estimator = make(name)
+    for measurement in stream:
+        assert_report_fits(estimator.update(measurement), measurement)
+        stamp_ns = measurement_stamp_ns(measurement) + ahead
+        pose = estimator.pose_at(stamp_ns)
+        if pose is not None:
+            assert_pose_is_sound(pose, stamp_ns)
+
+
+@EVERY_ESTIMATOR
+@LONG
+@given(stream=hostile_streams())
+def test_hostile_streams_after_an_honest_one(name: str, stream: list[Measurement]) -> None:
+    estimator = started(name)
+    for measurement in stream:
+        assert_report_fits(estimator.update(measurement), measurement)
+        pose = estimator.pose_at(2 * SECOND_NS)
+        if pose is not None:
+            assert_pose_is_sound(pose, 2 * SECOND_NS)
+
+
+@EVERY_ESTIMATOR
+@LONG
+@given(stream=hostile_streams())
+def test_same_input_twice_and_after_reset_says_the_same(name: str, stream: list[Measurement]) -> None:
+    estimator = make(name)
+    first = run(estimator, stream)
+    assert run(make(name), stream) == first
+    estimator.reset()
+    assert estimator.pose_at(measurement_stamp_ns(stream[0])) is None
+    assert run(estimator, stream) == first
+
+
+@EVERY_ESTIMATOR
+@LONG
+@given(stream=hostile_streams(), stamps=st.lists(st.integers(-SECOND_NS, 3 * SECOND_NS), max_size=3))
+def test_asking_for_poses_changes_nothing(name: str, stream: list[Measurement], stamps: list[int]) -> None:
+    asked, silent = make(name), make(name)
+    for measurement in [*standing_robot()[-6:], *stream]:
+        for stamp_ns in stamps:
+            assert written(asked.pose_at(stamp_ns)) == written(asked.pose_at(stamp_ns))
+        asked.update(measurement)
+        silent.update(measurement)
+    stamp_ns = measurement_stamp_ns(stream[-1])
+    assert written(asked.pose_at(stamp_ns)) == written(silent.pose_at(stamp_ns))
+
+
+@EVERY_ESTIMATOR
+def test_no_pose_before_the_first_measurement(name: str) -> None:
+    assert make(name).pose_at(0) is None
+
+
+@EVERY_ESTIMATOR
+def test_honest_stream_gives_the_true_pose(name: str) -> None:
+    pose = started(name).pose_at(2 * SECOND_NS)
+    assert pose is not None
+    assert_pose_is_sound(pose, 2 * SECOND_NS)
+    # An estimator without heading is off by the lever arm at most.
+    distance = float(np.linalg.norm(pose.xy - SETUP.start.pose[:2]))
+    assert distance <= float(np.linalg.norm(SETUP.tag_in_body[:2])) + 1e-6
+
+
+@EVERY_ESTIMATOR
+@pytest.mark.parametrize(
+    "late",
+    [
+        good_ranges(SECOND_NS),
+        PoseIncrement(0, SECOND_NS, np.array([0.1, 0.0, 0.0]), SMALL_COV, is_keyframe=True),
+        PoseIncrement(SECOND_NS, SECOND_NS, np.zeros(3), SMALL_COV, is_keyframe=True),
+    ],
+    ids=["ranges", "increment", "founding increment"],
+)
+def test_late_measurements_are_refused_and_change_nothing(name: str, late: Measurement) -> None:
+    estimator, undisturbed = started(name), started(name)
+    report = estimator.update(late)
+    assert_report_fits(report, late)
+    assert set(report.verdicts) <= {Verdict.LATE, Verdict.NOT_USED}
+    for measurement in (
+        good_ranges(2 * SECOND_NS + 1),
+        PoseIncrement(2 * SECOND_NS, 2 * SECOND_NS + 2, np.zeros(3), SMALL_COV, is_keyframe=False),
+    ):
+        assert run(estimator, [measurement]) == run(undisturbed, [measurement])
+
+
+@EVERY_ESTIMATOR
+def test_some_measurement_is_accepted(name: str) -> None:
+    estimator = make(name)
+    verdicts = [verdict for m in standing_robot() for verdict in estimator.update(m).verdicts]
+    assert set(verdicts) <= {Verdict.ACCEPTED, Verdict.NOT_USED}
+    assert Verdict.ACCEPTED in verdicts
+
+
+@EVERY_ESTIMATOR
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf"), 0.0, -5.0])
+def test_impossible_ranges_are_never_accepted_and_move_nothing(name: str, value: float) -> None:
+    estimator, undisturbed = started(name), started(name)
+    report = estimator.update(range_frame(2 * SECOND_NS, list(SETUP.anchors), [value] * 4))
+    assert set(report.verdicts) <= {Verdict.IMPOSSIBLE, Verdict.NOT_USED}
+    stamp_ns = 2 * SECOND_NS + 1000
+    assert written(estimator.pose_at(stamp_ns)) == written(undisturbed.pose_at(stamp_ns))
+
+
+@EVERY_ESTIMATOR
+def test_unknown_anchors_are_never_accepted(name: str) -> None:
+    report = started(name).update(range_frame(2 * SECOND_NS, [0, 9, -1], [3.0, 4.0, 5.0]))
+    assert set(report.verdicts) <= {Verdict.UNKNOWN_ANCHOR, Verdict.NOT_USED}
+
+
+@EVERY_ESTIMATOR
+def test_empty_frame_has_no_verdicts(name: str) -> None:
+    assert make(name).update(range_frame(0, [], [])).verdicts == ()
+
+
+@EVERY_ESTIMATOR
+@pytest.mark.parametrize(
+    "measurement",
+    [
+        Scan(2 * SECOND_NS, np.zeros(0), np.zeros(0), np.zeros(0), np.zeros(0)),
+        Scan(2 * SECOND_NS, np.zeros(2), np.ones(2), np.array([0.0, 0.1]), np.zeros(2)),
+        ImuSample(2 * SECOND_NS, np.full(3, np.nan), np.zeros(3)),
+        Attitude(2 * SECOND_NS, np.zeros(4)),
+    ],
+    ids=["empty scan", "scan", "imu", "attitude"],
+)
+def test_other_sensors_get_one_verdict(name: str, measurement: Measurement) -> None:
+    estimator = started(name)
+    assert len(estimator.update(measurement).verdicts) == 1
+    pose = estimator.pose_at(2 * SECOND_NS)
+    assert pose is not None
+    assert_pose_is_sound(pose, 2 * SECOND_NS)
