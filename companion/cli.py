@@ -300,6 +300,8 @@ def _progress() -> Iterator[Progress]:
         TaskProgressColumn(),
         TimeRemainingColumn(),
         console=err,
+        transient=True,
+        disable=not err.is_terminal,
     ) as progress:
         yield progress
 

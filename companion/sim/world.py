@@ -91,7 +91,7 @@ def _crossings(origins: FloatArray, directions: FloatArray, segments: FloatArray
     denominator = directions[:, 0:1] * edge[:, 1] - directions[:, 1:2] * edge[:, 0]
     to_start_x = start[:, 0] - origins[:, 0:1]
     to_start_y = start[:, 1] - origins[:, 1:2]
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         along = (to_start_x * edge[:, 1] - to_start_y * edge[:, 0]) / denominator
         across = (to_start_x * directions[:, 1:2] - to_start_y * directions[:, 0:1]) / denominator
         hit = (along > 1e-9) & (across >= 0.0) & (across <= 1.0)

@@ -35,10 +35,11 @@ HALL = Setup(
 
 
 def matched_config(range_gate: float = 1 - 1e-9) -> Ekf.Config:
-    """The world's own noise; the gates let everything pass unless told otherwise."""
+    """The world's own noise, nothing blocked; the gates let everything pass unless told otherwise."""
     return Ekf.Config(
         range_sigma=RANGE_SIGMA,
         range_gate=range_gate,
+        suspect_for=0.0,
         increment_gate=1 - 1e-9,
         accel_noise=ACCEL_NOISE,
         yaw_accel_noise=YAW_ACCEL_NOISE,
