@@ -1,5 +1,6 @@
 """The commands. Data goes to files or stdout, progress and messages to stderr."""
 
+import logging
 import signal
 import sys
 import threading
@@ -12,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 from rich.console import Console
+from rich.logging import RichHandler
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
@@ -263,6 +265,9 @@ def dump_config(
 
 def main() -> NoReturn:
     """Entry point: user errors become one line and exit code 2."""
+    logging.basicConfig(
+        level=logging.WARNING, format="%(message)s", handlers=[RichHandler(console=err, show_path=False)]
+    )
     try:
         app()
     except UserError as error:

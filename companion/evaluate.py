@@ -59,24 +59,38 @@ class Errors:
         """Horizontal error, (N,) [m]."""
         return np.hypot(self.error[:, 0], self.error[:, 1])
 
+    @property
+    def has_yaw(self) -> bool:
+        """Whether the heading is estimated, and its truth known, throughout."""
+        return bool(np.isfinite(self.error[:, 2]).all() and np.isfinite(self.cov[:, 2, 2]).all())
+
+    @property
+    def nees_dof(self) -> int:
+        """Expectation of `nees`: 3 with heading (x, y, yaw), 2 without."""
+        return 3 if self.has_yaw else 2
+
+    @property
+    def nees(self) -> FloatArray:
+        """Normalised estimation error squared, (N,)."""
+        dof = self.nees_dof
+        error, cov = self.error[:, :dof], self.cov[:, :dof, :dof]
+        whitened = np.linalg.solve(cov, error[:, :, None])[:, :, 0]
+        return np.asarray(np.einsum("ni,ni->n", error, whitened))
+
     def accuracy(self) -> Accuracy | None:
         """The figures of the table; None when nothing can be compared."""
         if len(self.stamps_ns) == 0:
             return None
         distance, yaw = self.distance, self.error[:, 2]
-        has_yaw = bool(np.isfinite(yaw).all() and np.isfinite(self.cov[:, 2, 2]).all())
-        dof = 3 if has_yaw else 2
-        error, cov = self.error[:, :dof], self.cov[:, :dof, :dof]
-        nees = np.einsum("ni,ni->n", error, np.linalg.solve(cov, error[:, :, None])[:, :, 0])
         return Accuracy(
             poses=len(distance),
             availability=self.availability,
             rmse=float(np.sqrt((distance**2).mean())),
             max=float(distance.max()),
             p95=float(np.percentile(distance, 95)),
-            yaw_rmse_deg=float(np.rad2deg(np.sqrt((yaw**2).mean()))) if has_yaw else None,
-            nees=float(nees.mean()),
-            nees_dof=dof,
+            yaw_rmse_deg=float(np.rad2deg(np.sqrt((yaw**2).mean()))) if self.has_yaw else None,
+            nees=float(self.nees.mean()),
+            nees_dof=self.nees_dof,
         )
 
 

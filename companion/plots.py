@@ -46,8 +46,8 @@ def figure(result: Replay, path: Path, title: str, obstacles: FloatArray | None)
     if primary is None or not len(primary.stamps_ns):
         explained = _draw_map(picture.add_subplot(), result, obstacles)
     else:
-        knows_yaw = [np.isfinite(_yaw_error(errors)).any() for errors in result.errors.values()]
-        panels = [_draw_position, *([_draw_heading] if any(knows_yaw) else []), _draw_nees]
+        knows_yaw = any(errors.has_yaw for errors in result.errors.values())
+        panels = [_draw_position, *([_draw_heading] if knows_yaw else []), _draw_nees]
         grid = picture.add_gridspec(len(panels), 2, width_ratios=[1.1, 1.0])
         explained = _draw_map(picture.add_subplot(grid[:, 0]), result, obstacles)
         for row, draw in enumerate(panels):
@@ -138,15 +138,10 @@ def _draw_errors(
 def _draw_nees(ax: Axes, result: Replay) -> None:
     primary = result.names[0]
     errors = result.errors[primary]
-    # Without an estimate of heading, or its truth, the error is one of x and y alone.
-    dof = 3 if np.isfinite(_yaw_error(errors)).any() else 2
-    error, cov = errors.error[:, :dof], errors.cov[:, :dof, :dof]
-    known = np.isfinite(error).all(axis=1) & np.isfinite(cov).all(axis=(1, 2))
-    error, cov = error[known], cov[known]
-    nees = np.einsum("ni,ni->n", error, np.linalg.solve(cov, error[:, :, None])[:, :, 0])
+    nees, dof = errors.nees, errors.nees_dof
     low, high = float(chi2.ppf(0.025, dof)), float(chi2.ppf(0.975, dof))
     ax.axhspan(low, high, color=_PRIMARY, alpha=0.15, linewidth=0.0)
-    ax.plot(_seconds(result, primary)[known], nees, color=_PRIMARY, linewidth=0.6)
+    ax.plot(_seconds(result, primary), nees, color=_PRIMARY, linewidth=0.6)
     ax.set_yscale("log")
     ax.yaxis.set_major_formatter("{x:g}")
     ax.set_ylim(0.2 * low, 3.0 * max(high, float(nees.max(initial=0.0))))

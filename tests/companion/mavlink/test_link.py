@@ -1,0 +1,110 @@
+"""The link to the autopilot over what pymavlink offers: UDP, TCP, serial; lost and found again."""
+
+import os
+import queue
+import socket
+import tty
+from pathlib import Path
+
+import pytest
+
+from companion.config import MavlinkTable
+from companion.errors import UserError
+from companion.mavlink.link import MavlinkLink
+from drivers.port import Arrival, PortEvent, PortStatus
+
+WAIT = 5.0
+
+
+@pytest.fixture
+def events() -> queue.Queue[PortEvent]:
+    return queue.Queue()
+
+
+def link_to(url: str, events: queue.Queue[PortEvent]) -> MavlinkLink:
+    link = MavlinkLink(MavlinkTable(url=url, baud=115_200), events.put)
+    link.start()
+    return link
+
+
+def wait_open(events: queue.Queue[PortEvent], is_open: bool = True) -> None:
+    while True:
+        event = events.get(timeout=WAIT)
+        if isinstance(event, PortStatus) and event.is_open is is_open:
+            return
+
+
+def received(events: queue.Queue[PortEvent]) -> bytes:
+    while True:
+        event = events.get(timeout=WAIT)
+        if isinstance(event, Arrival):
+            assert event.name == "mavlink"
+            return event.data
+
+
+def test_udp_both_ways(events: queue.Queue[PortEvent]) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as autopilot:
+        autopilot.bind(("127.0.0.1", 0))
+        autopilot.settimeout(WAIT)
+        link = link_to(f"udpout:127.0.0.1:{autopilot.getsockname()[1]}", events)
+        wait_open(events)
+        assert link.send(b"pose")
+        data, address = autopilot.recvfrom(100)
+        assert data == b"pose"
+        autopilot.sendto(b"heartbeat", address)
+        assert received(events) == b"heartbeat"
+        link.close()
+        assert not link.send(b"pose")
+
+
+def test_tcp_is_opened_again_when_the_other_side_restarts(events: queue.Queue[PortEvent]) -> None:
+    server = socket.create_server(("127.0.0.1", 0))
+    address = server.getsockname()
+    link = link_to(f"tcp:127.0.0.1:{address[1]}", events)
+    peer, _ = server.accept()
+    wait_open(events)
+    peer.sendall(b"first")
+    assert received(events) == b"first"
+    peer.close()
+    server.close()
+    wait_open(events, False)
+    with socket.create_server(address) as server:
+        peer, _ = server.accept()
+        wait_open(events)
+        assert link.send(b"again")
+        assert peer.recv(100) == b"again"
+        link.close()
+        peer.close()
+
+
+def test_a_serial_line_that_comes_later(tmp_path: Path, events: queue.Queue[PortEvent]) -> None:
+    path = tmp_path / "autopilot"
+    link = link_to(str(path), events)
+    status = events.get(timeout=WAIT)
+    assert isinstance(status, PortStatus)
+    assert not status.is_open
+    assert not link.send(b"pose")
+    master, slave = os.openpty()
+    tty.setraw(slave)
+    path.symlink_to(os.ttyname(slave))
+    wait_open(events)
+    os.write(master, b"heartbeat")
+    assert received(events) == b"heartbeat"
+    assert link.send(b"pose")
+    assert os.read(master, 100) == b"pose"
+    link.close()
+    os.close(master)
+    os.close(slave)
+
+
+@pytest.mark.parametrize("url", ["udpout:nowhere", "udpin:a:b:c", "tcp:host:port"])
+def test_a_device_string_that_makes_no_sense(url: str) -> None:
+    with pytest.raises(UserError, match="is no pymavlink device string"):
+        MavlinkLink(MavlinkTable(url=url), lambda _: None)
+
+
+def test_a_file_is_no_device(tmp_path: Path) -> None:
+    path = tmp_path / "flight.tlog"
+    path.write_bytes(b"")
+    with pytest.raises(UserError, match="is a file"):
+        MavlinkLink(MavlinkTable(url=str(path)), lambda _: None)
