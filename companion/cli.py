@@ -95,10 +95,12 @@ def demo(
         out.print(f"  {line}", highlight=False)
     definite = "all" if received.all_positive_definite else "NOT ALL"
     out.print(
-        f"  autopilot: received {received.poses} poses at {received.rate:.1f} Hz and {received.heartbeats} "
-        f"heartbeats, covariance {definite} positive definite; replay repeats them to "
-        f"{received.replay_difference * 1000:.3f} mm",
+        f"  autopilot: {received.poses} poses at {received.rate:.1f} Hz, {received.heartbeats} heartbeats, "
+        f"covariance {definite} positive definite",
         highlight=False,
+    )
+    out.print(
+        f"  replay: repeats the poses sent to {received.replay_difference * 1000:.3f} mm", highlight=False
     )
     out.print()
     out.print(f"  picture  {folder / 'demo.png'}", highlight=False)

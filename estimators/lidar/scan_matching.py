@@ -31,6 +31,8 @@ whose variance is 2.5 times that of m_k.
 LEAST_EIGENVALUE = 1.0
 """Information [1/m^2, 1/rad^2] that every direction has: what nothing observes comes out with sigma 1."""
 
+_LEAST_INFORMATION = LEAST_EIGENVALUE * np.eye(3)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Keyframe:
@@ -151,7 +153,7 @@ class ScanMatcher:
         keyframe = self._keyframe
         assert keyframe is not None
         sigma = self._config.range_sigma
-        information = LEAST_EIGENVALUE * np.eye(3)
+        information = _LEAST_INFORMATION
         matched, least_variance = 0, NOISY_SCANS * sigma**2
         for _ in range(20):
             turned = points @ rotation(pose[2]).T
@@ -167,13 +169,16 @@ class ScanMatcher:
             normals = keyframe.normals[index]
             residual = ((moved[found] - keyframe.points[index]) * normals).sum(axis=1)
             arm = turned[found]
-            jacobian = np.column_stack([normals, normals[:, 1] * arm[:, 0] - normals[:, 0] * arm[:, 1]])
+            jacobian = np.empty((matched, 3))
+            jacobian[:, :2] = normals
+            jacobian[:, 2] = normals[:, 1] * arm[:, 0] - normals[:, 0] * arm[:, 1]
             # Cauchy weight; its scale is the noise of two scans, or what the residuals say when larger.
-            scale = max(2.0 * sigma, 1.5 * float(np.median(np.abs(residual))))
+            middle = matched // 2
+            scale = max(2.0 * sigma, 1.5 * float(np.partition(np.abs(residual), middle)[middle]))
             weight = 1.0 / (1.0 + (residual / scale) ** 2)
             variance = max(least_variance, float((weight * residual**2).sum() / weight.sum()))
             weighted = jacobian * (weight / variance)[:, None]
-            information = jacobian.T @ weighted + LEAST_EIGENVALUE * np.eye(3)
+            information = jacobian.T @ weighted + _LEAST_INFORMATION
             step = np.linalg.solve(information, -weighted.T @ residual)
             pose = np.array([pose[0] + step[0], pose[1] + step[1], wrap_angle(pose[2] + step[2])])
             if float(np.abs(step).max()) < 1e-4:
