@@ -98,6 +98,7 @@ def demo(
         f"  autopilot: {received.poses} poses at {received.rate:.1f} Hz, {received.heartbeats} heartbeats, "
         f"covariance {definite} positive definite",
         highlight=False,
+        soft_wrap=True,
     )
     out.print(
         f"  replay: repeats the poses sent to {received.replay_difference * 1000:.3f} mm", highlight=False

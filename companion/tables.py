@@ -6,17 +6,17 @@ from companion.replay import Replay
 from estimators.base import Verdict
 
 LABELS = {
-    "ekf": "ekf (UWB + LiDAR)",
-    "least_squares": "least_squares (UWB only)",
-    "lidar_odometry": "lidar_odometry (LiDAR only)",
+    "ekf": "ekf: UWB + LiDAR",
+    "least_squares": "least_squares: UWB",
+    "lidar_odometry": "lidar_odometry: LiDAR",
 }
 
 
 def accuracy_table(result: Replay, title: str) -> Table:
     """Errors against truth, consistency and time of every estimator of a replay."""
     table = Table(title=title, title_justify="left")
-    table.add_column("estimator")
-    for heading in ("RMSE\nm", "max\nm", "95 %\nm", "yaw RMSE\ndeg", "NEES\n(expected)", "update\nms"):
+    table.add_column("estimator", no_wrap=True)
+    for heading in ("RMSE\nm", "max\nm", "95 %\nm", "yaw RMSE\ndeg", "NEES\n(expect)", "update\nms"):
         table.add_column(heading, justify="right")
     for name in result.names:
         accuracy = result.accuracy(name)
