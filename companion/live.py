@@ -66,6 +66,8 @@ class LiveRun:
         self.status = LiveStatus()
         self._say = say
         self._queue: queue.Queue[PortEvent] = queue.Queue(QUEUE_LENGTH)
+        # First what may refuse its settings, so that a wrong call leaves no folder behind.
+        self._link = MavlinkLink(config.mavlink, self._put) if config.mavlink.url else None
         start_ns = time.monotonic_ns()
         self._log = LogWriter(folder / "raw.mcap", config.to_toml(), start_ns)
         try:
@@ -80,7 +82,6 @@ class LiveRun:
             name: Port(name, parse_address(table.port), self._put) for name, table in config.sensor.items()
         }
         self._session = MavlinkSession(config.mavlink, config.map_heading())
-        self._link = MavlinkLink(config.mavlink, self._put) if config.mavlink.url else None
 
     def run(self, stop: threading.Event) -> None:
         """Work until `stop` is set, then leave the devices quiet and close everything."""

@@ -3,10 +3,15 @@
 from pathlib import Path
 
 import pytest
+from hypothesis import HealthCheck, settings
 
 from companion.config import Config, load_config, params_dir
 from companion.sim.scenario import Scenario, load_scenario
 from companion.sim.simulate import simulate
+
+# A busy machine is no failure: examples may take their time.
+settings.register_profile("patient", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("patient")
 
 SCENARIO = params_dir() / "scenarios" / "square_room.toml"
 SITE = params_dir() / "sites" / "demo_room.toml"
