@@ -11,16 +11,16 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from companion.config import Config
+from companion.config import Config, MavlinkTable, SensorTable
 from companion.errors import UserError
 from companion.health import Health
 from companion.log import Direction, LogWriter, RawChunk
 from companion.mavlink.link import NAME as MAVLINK
-from companion.mavlink.link import MavlinkLink
+from companion.mavlink.link import wire_opener
 from companion.mavlink.session import MavlinkSession
 from companion.pipeline import Chain, Tick, make_pipeline
 from companion.replay import tum_line
-from drivers.port import Port, PortEvent, PortStatus, parse_address
+from drivers.port import Port, PortEvent, PortStatus, SerialWire, parse_address
 from estimators.messages import PoseEstimate
 
 QUEUE_LENGTH = 10_000
@@ -67,7 +67,7 @@ class LiveRun:
         self._say = say
         self._queue: queue.Queue[PortEvent] = queue.Queue(QUEUE_LENGTH)
         # First what may refuse its settings, so that a wrong call leaves no folder behind.
-        self._link = MavlinkLink(config.mavlink, self._put) if config.mavlink.url else None
+        self._link = self._make_link(config.mavlink)
         start_ns = time.monotonic_ns()
         self._log = LogWriter(folder / "raw.mcap", config.to_toml(), start_ns)
         try:
@@ -78,9 +78,7 @@ class LiveRun:
         self._primary = config.pipeline.estimator
         self._period_ns = round(1e9 / config.pipeline.rate)
         self._chain = Chain(config, start_ns, make_pipeline(config, [self._primary]), self._primary)
-        self._ports = {
-            name: Port(name, parse_address(table.port), self._put) for name, table in config.sensor.items()
-        }
+        self._ports = {name: self._make_port(name, table) for name, table in config.sensor.items()}
         self._session = MavlinkSession(config.mavlink, config.map_heading())
 
     def run(self, stop: threading.Event) -> None:
@@ -96,6 +94,13 @@ class LiveRun:
                 self._talk_to_devices()
         finally:
             self._close()
+
+    def _make_link(self, table: MavlinkTable) -> Port | None:
+        return Port(MAVLINK, table.url, wire_opener(table), self._put) if table.url else None
+
+    def _make_port(self, name: str, table: SensorTable) -> Port:
+        address = parse_address(table.port)
+        return Port(name, address.url, lambda: SerialWire(address), self._put)
 
     def _put(self, event: PortEvent) -> None:
         try:
@@ -147,7 +152,7 @@ class LiveRun:
             pose = None
         packed = self._session.poses_packed
         data = self._session.tick(pose, tick.health, now_ns)
-        if data and self._link is not None and self._link.send(data):
+        if data and self._link is not None and self._link.write(data):
             self.status.poses_sent += self._session.poses_packed - packed
             self._log.raw(RawChunk(MAVLINK, Direction.OUT, now_ns, data))
 

@@ -10,7 +10,7 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import Protocol, TypeAlias
 from urllib.parse import parse_qsl
 
 import serial
@@ -94,20 +94,38 @@ def parse_address(text: str) -> PortAddress:
     return PortAddress(url, int(baud))
 
 
+class Wire(Protocol):
+    """An open line to a device."""
+
+    def read(self) -> bytes:
+        """Wait a fraction of a second for bytes; raises OSError when the line is lost."""
+        ...
+
+    def write(self, data: bytes) -> None:
+        """Send bytes as one write; raises OSError when the line is lost."""
+        ...
+
+    def close(self) -> None:
+        """Give the line up."""
+        ...
+
+
 class Port:
-    """A reader thread round one device.
+    """A reader thread round one device, which opens it again when it is lost.
 
     Args:
         name: goes with everything that is sent to the sink.
-        address: where the device is.
+        label: where the device is, for messages.
+        open_wire: opens the line; raises PortError when that fails.
         sink: takes arrivals and status changes, from the reader's thread; must not block.
     """
 
-    def __init__(self, name: str, address: PortAddress, sink: Sink) -> None:
+    def __init__(self, name: str, label: str, open_wire: Callable[[], Wire], sink: Sink) -> None:
         self._name = name
-        self._address = address
+        self._label = label
+        self._open_wire = open_wire
         self._sink = sink
-        self._device: serial.SerialBase | None = None
+        self._wire: Wire | None = None
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"port-{name}", daemon=True)
 
@@ -117,12 +135,12 @@ class Port:
 
     def write(self, data: bytes) -> bool:
         """Send bytes as one write; False when the port is not open or refuses them."""
-        device = self._device
-        if device is None:
+        wire = self._wire
+        if wire is None:
             return False
         try:
-            device.write(data)
-        except (OSError, serial.SerialException):
+            wire.write(data)
+        except OSError:
             # The reader meets the same fault and opens the port again.
             return False
         return True
@@ -136,7 +154,7 @@ class Port:
         reported = ""
         while not self._closing.is_set():
             try:
-                self._device = _open(self._address)
+                self._wire = self._open_wire()
             except PortError as error:
                 if str(error) != reported:
                     reported = str(error)
@@ -144,54 +162,69 @@ class Port:
                 self._closing.wait(RETRY_PERIOD)
                 continue
             reported = ""
-            self._status(True, f"{self._address.url} open")
+            self._status(True, f"{self._label} open")
             try:
-                self._read(self._device)
-            except (OSError, serial.SerialException) as error:
-                self._status(False, f"{self._address.url} lost: {error}; waiting for it")
+                self._read(self._wire)
+            except OSError as error:
+                self._status(False, f"{self._label} lost: {error}; waiting for it")
                 self._closing.wait(RETRY_PERIOD)
             finally:
-                device, self._device = self._device, None
-                device.close()
+                wire, self._wire = self._wire, None
+                wire.close()
 
-    def _read(self, device: serial.SerialBase) -> None:
-        is_network = "socket://" in self._address.url
-        if is_network:
-            device.timeout = NETWORK_BATCH
+    def _read(self, wire: Wire) -> None:
         while not self._closing.is_set():
-            if is_network:
-                data = device.read(4096)
-            else:
-                data = device.read(1)
-                data += device.read(device.in_waiting)  # type: ignore[attr-defined]
+            data = wire.read()
             if data:
-                self._sink(Arrival(self._name, time.monotonic_ns(), bytes(data)))
+                self._sink(Arrival(self._name, time.monotonic_ns(), data))
 
     def _status(self, is_open: bool, message: str) -> None:
         self._sink(PortStatus(self._name, time.monotonic_ns(), is_open, message))
 
 
-def _open(address: PortAddress) -> serial.SerialBase:
-    try:
-        device = serial.serial_for_url(
-            address.url,
-            do_not_open=True,
-            baudrate=address.baud,
-            timeout=READ_TIMEOUT,
-            write_timeout=0.5,
-        )
-        if isinstance(device, serial.Serial):
-            # Two readers of one line each get half of the bytes.
-            device.exclusive = True
-            # An RPLIDAR A1 runs its motor while DTR is off; no other device here uses the line.
-            device.dtr = False
-        device.open()
-    except (OSError, serial.SerialException, ValueError) as error:
-        raise PortError(f"cannot open {address.url}: {_reason(error)}") from error
-    return device
+class SerialWire:
+    """A serial line, or what a pyserial URL stands for.
+
+    Args:
+        address: where the device is.
+
+    Raises:
+        PortError: it cannot be opened; the message says why.
+    """
+
+    def __init__(self, address: PortAddress) -> None:
+        self._is_network = "socket://" in address.url
+        timeout = NETWORK_BATCH if self._is_network else READ_TIMEOUT
+        try:
+            self._device = serial.serial_for_url(
+                address.url, do_not_open=True, baudrate=address.baud, timeout=timeout, write_timeout=0.5
+            )
+            if isinstance(self._device, serial.Serial):
+                # Two readers of one line each get half of the bytes.
+                self._device.exclusive = True
+                # An RPLIDAR A1 runs its motor while DTR is off; no other device here uses the line.
+                self._device.dtr = False
+            self._device.open()
+        except (OSError, ValueError) as error:
+            raise PortError(f"cannot open {address.url}: {reason(error)}") from error
+
+    def read(self) -> bytes:
+        """What is there, or the next byte when there is nothing yet."""
+        if self._is_network:
+            return bytes(self._device.read(4096))
+        data = self._device.read(1)
+        return bytes(data + self._device.read(self._device.in_waiting))
+
+    def write(self, data: bytes) -> None:
+        """Send bytes."""
+        self._device.write(data)
+
+    def close(self) -> None:
+        """Close the line."""
+        self._device.close()
 
 
-def _reason(error: Exception) -> str:
+def reason(error: Exception) -> str:
     """The operating system's own words: pyserial wraps them, or gives only a number."""
     number = error.errno if isinstance(error, OSError) else None
     if number is None:

@@ -1,100 +1,79 @@
-"""The wire to the autopilot: any pymavlink device string, opened again when it is lost."""
+"""The wire to the autopilot: any pymavlink device string. Bytes only, no parsing."""
 
-import threading
-import time
+from collections.abc import Callable
 from pathlib import Path
 
-import serial
 from pymavlink import mavutil
 
 from companion.config import MavlinkTable
 from companion.errors import UserError
-from drivers.port import Arrival, PortStatus, Sink
+from drivers.errors import PortError
+from drivers.port import Wire, reason
 
 NAME = "mavlink"
-RETRY_PERIOD = 1.0
-"""Time between attempts to open the link [s]."""
-_FAULTS = (OSError, serial.SerialException)
+"""Name of the link where sensors have theirs: in the log and in messages."""
+READ_TIMEOUT = 0.1
+"""Longest wait for bytes [s]."""
 
 
-class MavlinkLink:
-    """A reader thread round one pymavlink connection; bytes only, no parsing.
+class MavlinkWire:
+    """One pymavlink connection.
 
     Args:
         table: device string and baud.
-        sink: takes arrivals and status changes, from the reader's thread; must not block.
 
     Raises:
-        UserError: the device string makes no sense.
+        PortError: it cannot be opened now.
+        ValueError: the device string makes no sense.
     """
 
-    def __init__(self, table: MavlinkTable, sink: Sink) -> None:
-        if Path(table.url).is_file():
-            raise UserError(f"mavlink.url: {table.url} is a file; give a device such as udpout:host:14550")
-        self._table = table
-        self._sink = sink
-        self._connection: mavutil.mavfile | None = None
+    def __init__(self, table: MavlinkTable) -> None:
         try:
-            self._connection = self._connect()
-        except ValueError as error:
-            raise UserError(f"mavlink.url: {table.url!r} is no pymavlink device string: {error}") from error
-        except _FAULTS as error:
-            self._status(False, f"cannot open {table.url}: {error}; trying again")
-        self._closing = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="mavlink", daemon=True)
+            # One attempt: pymavlink's own retries print and sleep.
+            self._connection = mavutil.mavlink_connection(table.url, baud=table.baud, retries=1)
+        except OSError as error:
+            raise PortError(f"cannot open {table.url}: {reason(error)}") from error
+        # These have no other side that could close them; an empty read means nothing there.
+        self._is_stream = not isinstance(
+            self._connection, mavutil.mavudp | mavutil.mavmcast | mavutil.mavserial
+        )
 
-    def start(self) -> None:
-        """Begin reading."""
-        self._thread.start()
+    def read(self) -> bytes:
+        """Bytes that came within a tenth of a second."""
+        if self._connection.portdead:
+            raise ConnectionError("write failed")
+        if not self._connection.select(READ_TIMEOUT):
+            return b""
+        data = self._connection.recv(4096)
+        if not data and self._is_stream:
+            raise ConnectionError("closed by the other side")
+        # pymavlink's UDP gives an empty str when nothing is there.
+        return bytes(data or b"")
 
-    def send(self, data: bytes) -> bool:
-        """Send bytes; False when the link is down."""
-        connection = self._connection
-        if connection is None:
-            return False
-        try:
-            connection.write(data)
-        except _FAULTS:
-            return False
-        return not connection.portdead
+    def write(self, data: bytes) -> None:
+        """Send bytes."""
+        self._connection.write(data)
+        if self._connection.portdead:
+            raise ConnectionError("write failed")
 
     def close(self) -> None:
-        """Stop reading and close the link."""
-        self._closing.set()
-        self._thread.join(timeout=2.0)
+        """Close the connection."""
+        self._connection.close()
 
-    def _connect(self) -> mavutil.mavfile:
-        # One attempt a call: pymavlink's own retries print and sleep.
-        return mavutil.mavlink_connection(self._table.url, baud=self._table.baud, retries=1)
 
-    def _run(self) -> None:
-        while not self._closing.is_set():
-            try:
-                if self._connection is None:
-                    self._connection = self._connect()
-                self._status(True, f"{self._table.url} open")
-                self._read(self._connection)
-            except _FAULTS as error:
-                if self._connection is not None:
-                    self._status(False, f"{self._table.url} lost: {error}; trying again")
-                self._closing.wait(RETRY_PERIOD)
-            finally:
-                connection, self._connection = self._connection, None
-                if connection is not None:
-                    connection.close()
+def wire_opener(table: MavlinkTable) -> Callable[[], Wire]:
+    """What opens the link, now and whenever it is lost; the first connection is made at once.
 
-    def _read(self, connection: mavutil.mavfile) -> None:
-        is_stream = not isinstance(connection, mavutil.mavudp | mavutil.mavmcast | mavutil.mavserial)
-        while not self._closing.is_set():
-            if not connection.select(0.1):
-                continue
-            data = connection.recv(4096)
-            if data:
-                self._sink(Arrival(NAME, time.monotonic_ns(), bytes(data)))
-            elif is_stream:
-                raise ConnectionError("closed by the other side")
-            if connection.portdead:
-                raise ConnectionError("write failed")
-
-    def _status(self, is_open: bool, message: str) -> None:
-        self._sink(PortStatus(NAME, time.monotonic_ns(), is_open, message))
+    Raises:
+        UserError: the device string makes no sense. A device that is only missing is waited for.
+    """
+    if Path(table.url).is_file():
+        raise UserError(f"mavlink.url: {table.url} is a file; give a device such as udpout:host:14550")
+    ready: list[Wire] = []
+    try:
+        ready.append(MavlinkWire(table))
+    except ValueError as error:
+        raise UserError(f"mavlink.url: {table.url!r} is no pymavlink device string: {error}") from error
+    except PortError:
+        pass
+    return lambda: ready.pop() if ready else MavlinkWire(table)

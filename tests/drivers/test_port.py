@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from drivers.errors import PortError
-from drivers.port import Arrival, Port, PortAddress, PortEvent, PortStatus, parse_address
+from drivers.port import Arrival, Port, PortAddress, PortEvent, PortStatus, SerialWire, parse_address
 
 WAIT = 5.0
 
@@ -47,7 +47,7 @@ def events() -> queue.Queue[PortEvent]:
 
 
 def open_port(address: PortAddress, events: queue.Queue[PortEvent]) -> Port:
-    port = Port("uwb", address, events.put)
+    port = Port("uwb", address.url, lambda: SerialWire(address), events.put)
     port.start()
     return port
 

@@ -10,8 +10,8 @@ import pytest
 
 from companion.config import MavlinkTable
 from companion.errors import UserError
-from companion.mavlink.link import MavlinkLink
-from drivers.port import Arrival, PortEvent, PortStatus
+from companion.mavlink.link import NAME, wire_opener
+from drivers.port import Arrival, Port, PortEvent, PortStatus
 
 WAIT = 5.0
 
@@ -21,8 +21,8 @@ def events() -> queue.Queue[PortEvent]:
     return queue.Queue()
 
 
-def link_to(url: str, events: queue.Queue[PortEvent]) -> MavlinkLink:
-    link = MavlinkLink(MavlinkTable(url=url, baud=115_200), events.put)
+def link_to(url: str, events: queue.Queue[PortEvent]) -> Port:
+    link = Port(NAME, url, wire_opener(MavlinkTable(url=url, baud=115_200)), events.put)
     link.start()
     return link
 
@@ -48,13 +48,13 @@ def test_udp_both_ways(events: queue.Queue[PortEvent]) -> None:
         autopilot.settimeout(WAIT)
         link = link_to(f"udpout:127.0.0.1:{autopilot.getsockname()[1]}", events)
         wait_open(events)
-        assert link.send(b"pose")
+        assert link.write(b"pose")
         data, address = autopilot.recvfrom(100)
         assert data == b"pose"
         autopilot.sendto(b"heartbeat", address)
         assert received(events) == b"heartbeat"
         link.close()
-        assert not link.send(b"pose")
+        assert not link.write(b"pose")
 
 
 def test_tcp_is_opened_again_when_the_other_side_restarts(events: queue.Queue[PortEvent]) -> None:
@@ -71,7 +71,7 @@ def test_tcp_is_opened_again_when_the_other_side_restarts(events: queue.Queue[Po
     with socket.create_server(address) as server:
         peer, _ = server.accept()
         wait_open(events)
-        assert link.send(b"again")
+        assert link.write(b"again")
         assert peer.recv(100) == b"again"
         link.close()
         peer.close()
@@ -82,15 +82,15 @@ def test_a_serial_line_that_comes_later(tmp_path: Path, events: queue.Queue[Port
     link = link_to(str(path), events)
     status = events.get(timeout=WAIT)
     assert isinstance(status, PortStatus)
-    assert not status.is_open
-    assert not link.send(b"pose")
+    assert status.message == f"cannot open {path}: No such file or directory; waiting for it"
+    assert not link.write(b"pose")
     master, slave = os.openpty()
     tty.setraw(slave)
     path.symlink_to(os.ttyname(slave))
     wait_open(events)
     os.write(master, b"heartbeat")
     assert received(events) == b"heartbeat"
-    assert link.send(b"pose")
+    assert link.write(b"pose")
     assert os.read(master, 100) == b"pose"
     link.close()
     os.close(master)
@@ -100,11 +100,11 @@ def test_a_serial_line_that_comes_later(tmp_path: Path, events: queue.Queue[Port
 @pytest.mark.parametrize("url", ["udpout:nowhere", "udpin:a:b:c", "tcp:host:port"])
 def test_a_device_string_that_makes_no_sense(url: str) -> None:
     with pytest.raises(UserError, match="is no pymavlink device string"):
-        MavlinkLink(MavlinkTable(url=url), lambda _: None)
+        wire_opener(MavlinkTable(url=url))
 
 
 def test_a_file_is_no_device(tmp_path: Path) -> None:
     path = tmp_path / "flight.tlog"
     path.write_bytes(b"")
     with pytest.raises(UserError, match="is a file"):
-        MavlinkLink(MavlinkTable(url=str(path)), lambda _: None)
+        wire_opener(MavlinkTable(url=str(path)))
