@@ -209,12 +209,17 @@ def replay(
     folder: Annotated[
         Path | None, typer.Option("--out", metavar="DIR", help="Folder to write; default out/LOGNAME.")
     ] = None,
+    site: Annotated[
+        Path | None,
+        typer.Option("--site", metavar="FILE", help="Site file instead of the log's own settings."),
+    ] = None,
     sets: Sets = None,
 ) -> None:
     """Run a log through the very same decoders and estimators as live, without sleeping.
 
     Writes poses.tum, summary.json, config.toml and replay.rrd. The same log and settings give the same
-    poses, byte for byte. The settings are those stored in the log; change them with --set.
+    poses, byte for byte. The settings are those stored in the log; change them with --set, or give a
+    corrected site file with --site.
     """
     from companion.log import Log
     from companion.replay import config_of, write_outputs
@@ -224,7 +229,7 @@ def replay(
     from estimators import ESTIMATORS
 
     opened = Log(log)
-    config = config_of(opened, sets or [])
+    config = load_config(_named(site, "sites"), sets or []) if site else config_of(opened, sets or [])
     names = list(dict.fromkeys(estimator or [config.pipeline.estimator]))
     for name in names:
         if name not in ESTIMATORS:

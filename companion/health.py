@@ -66,7 +66,9 @@ class HealthMonitor:
         self._table = table
         self._has_ranges = has_ranges
         self._has_scans = has_scans
-        self._accepted_share = 1.0
+        # Nothing is believed before ranges have agreed with the start pose for a while.
+        self._accepted_share = 0.0
+        self._has_agreed = False
         self._share_stamp_ns: int | None = None
         self._range_ns: int | None = None
         self._increment_ns: int | None = None
@@ -91,6 +93,7 @@ class HealthMonitor:
         keep = np.exp(-dt / MEMORY)
         self._accepted_share = float(keep * self._accepted_share + (1.0 - keep) * good / judged)
         self._share_stamp_ns = stamp_ns
+        self._has_agreed |= self._accepted_share >= self._table.min_accepted_share
 
     def judge(self, pose: PoseEstimate | None, now_ns: int) -> Health:
         """State at `now_ns` for the pose that would be sent."""
@@ -103,8 +106,7 @@ class HealthMonitor:
             return Health(State.STARTING, f"waiting for the first {awaited[0]}")
         if not (np.isfinite(pose.T_map_body).all() and np.isfinite(pose.cov).all()):
             return Health(State.LOST, "pose or covariance is not finite")
-        eigenvalues = np.linalg.eigvalsh(pose.cov)
-        if eigenvalues[0] <= 0.0:
+        if np.linalg.eigvalsh(pose.cov)[0] <= 0.0:
             return Health(State.LOST, "covariance is not positive definite")
         sigma_xy = float(np.sqrt(np.linalg.eigvalsh(pose.cov[:2, :2])[1]))
         if sigma_xy > table.max_sigma_xy:
@@ -114,12 +116,20 @@ class HealthMonitor:
             return Health(
                 State.LOST, f"heading sigma {sigma_yaw:.0f} deg above {table.max_sigma_yaw_deg:g} deg"
             )
-        if self._accepted_share < table.min_accepted_share:
-            return Health(State.LOST, f"only {self._accepted_share:.0%} of recent ranges agree with the pose")
+        if self._has_ranges and self._accepted_share < table.min_accepted_share:
+            return self._disagreement()
         stale = [f"no {s.what} accepted for {s.age:.1f} s" for s in sources if s.is_stale]
         if len(stale) == len(sources):
             return Health(State.LOST, "; ".join(stale))
         return Health(State.DEGRADED, stale[0]) if stale else Health(State.OK, "")
+
+    def _disagreement(self) -> Health:
+        if self._share_stamp_ns is None:
+            return Health(State.STARTING, "no range yet that could confirm the start pose")
+        share = f"{self._accepted_share:.0%} of recent ranges agree with the pose"
+        if self._has_agreed:
+            return Health(State.LOST, f"only {share}")
+        return Health(State.STARTING, f"{share}; is the robot on its start mark?")
 
     def _sources(self, now_ns: int) -> list[_Source]:
         def source(what: str, seen_ns: int | None, limit: float) -> _Source:

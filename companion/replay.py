@@ -111,7 +111,8 @@ def config_of(log: Log, sets: list[str]) -> Config:
     Raises:
         UserError: an assignment is wrong, or the stored configuration does not fit this version.
     """
-    return config_from_toml(log.config_toml, f"{log.path} (recorded by version {log.version})", sets)
+    origin = f"{log.path} (recorded by version {log.version}; --site FILE replaces its settings)"
+    return config_from_toml(log.config_toml, origin, sets)
 
 
 def replay(

@@ -146,7 +146,7 @@ class LidarOdometry:
     def _correct(self, measured: FloatArray, H: FloatArray, predicted: FloatArray, R: FloatArray) -> None:
         residual = np.subtract if len(measured) == 1 else _increment_residual
         self._filter.update(measured, lambda _: H, lambda _: predicted, R=R, residual=residual)
-        for i in (2, 8):
+        for i in (2, 8):  # headings of the pose and of the reference
             self._filter.x[i] = wrap_angle(self._filter.x[i])
         self._filter.P = 0.5 * (self._filter.P + self._filter.P.T)
 

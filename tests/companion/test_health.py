@@ -73,12 +73,27 @@ def test_lost_when_every_sensor_is_missing() -> None:
     assert state(monitor_at(5.0, ranges_until=2.0, increments_until=2.0), 5.0, pose()) is State.LOST
 
 
-def test_lost_while_ranges_disagree_with_the_pose_and_back_when_they_agree() -> None:
-    monitor = monitor_at(20.0, good=0, ranges_until=20.0)
-    assert state(monitor, 20.0, pose()) is State.LOST
-    for stamp_ns in range(20 * SECOND, 30 * SECOND, SECOND // 10):
-        monitor.observe(ranges(stamp_ns), Report((Verdict.ACCEPTED,) * 4))
+def go_on(monitor: HealthMonitor, begin: int, end: int, verdict: Verdict) -> None:
+    for stamp_ns in range(begin * SECOND, end * SECOND, SECOND // 10):
+        monitor.observe(ranges(stamp_ns), Report((verdict,) * 4))
         monitor.observe(increment(stamp_ns), Report((Verdict.ACCEPTED,)))
+
+
+def test_lost_while_ranges_disagree_with_the_pose_and_back_when_they_agree() -> None:
+    monitor = monitor_at(5.0)
+    assert state(monitor, 5.0, pose()) is State.OK
+    go_on(monitor, 5, 15, Verdict.GATED)
+    assert state(monitor, 15.0, pose()) is State.LOST
+    go_on(monitor, 15, 25, Verdict.ACCEPTED)
+    assert state(monitor, 25.0, pose()) is State.OK
+
+
+def test_starting_and_not_sent_while_the_first_ranges_disagree_with_the_start_pose() -> None:
+    monitor = monitor_at(20.0, good=0)
+    health = monitor.judge(pose(), 20 * SECOND)
+    assert (health.state, health.sends) == (State.STARTING, False)
+    assert "start mark" in health.reason
+    go_on(monitor, 20, 30, Verdict.ACCEPTED)
     assert state(monitor, 30.0, pose()) is State.OK
 
 

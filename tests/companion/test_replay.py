@@ -157,6 +157,13 @@ def test_without_uwb_it_goes_on_and_says_so(short_log: Path, tmp_path: Path) -> 
     assert accuracy.rmse < 0.15
 
 
+@pytest.mark.parametrize("wrong", ["start.x=3.5", "start.y=3.0"])
+def test_a_robot_that_is_not_on_its_start_mark_sends_nothing(short_log: Path, wrong: str) -> None:
+    result = run(short_log, ["ekf"], [wrong])
+    assert result.health["starting"] > 100
+    assert result.health["ok"] == result.health["degraded"] == 0
+
+
 def test_damaged_bytes_cost_frames_not_the_run(short_log: Path, tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
 
@@ -193,5 +200,7 @@ def test_a_log_without_the_sites_sensors_is_refused(config: Config, tmp_path: Pa
 
 def test_a_log_whose_configuration_no_longer_fits_is_refused(tmp_path: Path) -> None:
     LogWriter(tmp_path / "old.mcap", "[anchors]\n", 0).close()
-    with pytest.raises(UserError, match=r"old\.mcap \(recorded by version .*\): anchors: 0 anchors given"):
+    with pytest.raises(
+        UserError, match=r"old\.mcap \(recorded by version .*--site FILE.*\): anchors: 0 anchors"
+    ):
         run(tmp_path / "old.mcap", ["ekf"])
