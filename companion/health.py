@@ -104,6 +104,8 @@ class HealthMonitor:
         awaited = [s.what for s in sources if s.first_awaited and not s.is_stale]
         if awaited:
             return Health(State.STARTING, f"waiting for the first {awaited[0]}")
+        if np.isposinf(pose.cov[5, 5]):
+            return Health(State.LOST, "heading not known: start again on the start mark")
         if not (np.isfinite(pose.T_map_body).all() and np.isfinite(pose.cov).all()):
             return Health(State.LOST, "pose or covariance is not finite")
         if np.linalg.eigvalsh(pose.cov)[0] <= 0.0:

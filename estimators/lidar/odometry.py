@@ -20,6 +20,12 @@ MOVING = slice(0, 6)
 REFERENCE = slice(6, 9)
 START_SPEED_SIGMA = 0.3
 """Standard deviation of each velocity when the robot sets off [m/s, rad/s]."""
+MAX_HEADING_SIGMA = 0.35
+"""An odometry that begins anew with a heading less certain than this [rad] leaves the heading unknown.
+
+Beyond some 20 deg a filter that is linear in the heading grows sure of a wrong one. A gap in the scans is no
+such case while the matcher finds its old keyframe again: then the reference, and its heading, is still held.
+"""
 
 
 class LidarOdometry:
@@ -67,6 +73,7 @@ class LidarOdometry:
         self._stands = True
         self._stamp_ns: int | None = None
         self._reference_stamp_ns: int | None = None
+        self._heading_known = True
 
     @property
     def state(self) -> tuple[FloatArray, FloatArray]:
@@ -86,12 +93,18 @@ class LidarOdometry:
         return Report((Verdict.NOT_USED,) * count)
 
     def pose_at(self, stamp_ns: int) -> PoseEstimate | None:
-        """Pose predicted with constant velocity; None before the first measurement."""
+        """Pose predicted with constant velocity; None before the first measurement.
+
+        The variance of yaw is infinite once the heading was lost (see `MAX_HEADING_SIGMA`), until reset.
+        """
         if self._stamp_ns is None:
             return None
         F, Q = self._motion(0.0 if self._stands else (stamp_ns - self._stamp_ns) * 1e-9)
         mean = F @ self._filter.x[MOVING]
         cov = (F @ self._filter.P[MOVING, MOVING] @ F.T + Q)[POSE, POSE]
+        if not self._heading_known:
+            cov[2, :2] = cov[:2, 2] = 0.0
+            cov[2, 2] = np.inf
         T_map_body = lift(mean[POSE], self._setup.height)
         return PoseEstimate(stamp_ns, T_map_body, self._setup.lift_covariance(cov), 0)
 
@@ -128,6 +141,7 @@ class LidarOdometry:
             self._set_off()
         self._predict_to(measured.stamp_ns)
         if founds:
+            self._heading_known &= bool(self._filter.P[2, 2] < MAX_HEADING_SIGMA**2)
             return Report((Verdict.ACCEPTED,))
         if not (has_reference and is_possible):
             return Report((Verdict.NO_REFERENCE if is_possible else Verdict.IMPOSSIBLE,))

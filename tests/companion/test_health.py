@@ -123,3 +123,11 @@ def test_a_covariance_that_is_none_is_not_sent() -> None:
     cov = np.eye(6) * 0.01
     cov[0, 1] = cov[1, 0] = 0.02
     assert state(monitor_at(5.0), 5.0, pose(cov)) is State.LOST
+
+
+def test_an_unknown_heading_is_named() -> None:
+    cov = np.eye(6) * 0.01
+    cov[5, 5] = np.inf
+    health = monitor_at(5.0).judge(pose(cov), 5 * SECOND)
+    assert (health.state, health.sends) == (State.LOST, False)
+    assert "heading not known" in health.reason

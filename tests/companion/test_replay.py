@@ -142,6 +142,37 @@ def test_without_lidar_it_says_so_and_stops_before_it_is_wrong(short_log: Path, 
     assert (errors.distance[sent] < 5.0 * sigma[sent]).all()
 
 
+@pytest.mark.parametrize("off", [0.4, 1.0, 2.0, 4.0])
+def test_after_a_gap_in_the_scans_no_wrong_heading_is_sent(
+    short_log: Path, tmp_path: Path, off: float
+) -> None:
+    # The robot turns from 5.9 s to 8 s after the start.
+    begin_ns = 6_500_000_000
+    path = edited(
+        short_log,
+        tmp_path / "gap.mcap",
+        lambda r: (
+            None
+            if isinstance(r, RawChunk) and r.source == "lidar" and 0 <= r.stamp_ns - begin_ns < off * 1e9
+            else r
+        ),
+    )
+    log = Log(path)
+    sent: list[int] = []
+    result = replay(
+        log,
+        config_of(log, []),
+        ["ekf"],
+        lambda tick, _: sent.append(tick.stamp_ns) if tick.health.sends else None,
+    )
+    errors = result.errors["ekf"]
+    rows = np.isin(errors.stamps_ns, sent)
+    assert rows.any()
+    yaw_error, yaw_sigma = np.abs(errors.error[rows, 2]), np.sqrt(errors.cov[rows, 2, 2])
+    assert (yaw_error < np.maximum(4.0 * yaw_sigma, np.deg2rad(3.0))).all()
+    assert yaw_error.max() < np.deg2rad(60.0)
+
+
 def test_without_uwb_it_goes_on_and_says_so(short_log: Path, tmp_path: Path) -> None:
     off_ns = 5_000_000_000
     path = edited(
