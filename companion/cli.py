@@ -8,6 +8,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import datetime
+from math import degrees
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NoReturn
 
@@ -341,9 +342,15 @@ def _status_line(status: "LiveStatus") -> str:
         return "starting: no pose yet"
     x, y = pose.xy
     sigma = float(max(pose.cov[0, 0], pose.cov[1, 1]) ** 0.5)
-    autopilot = f"autopilot {status.autopilot}" if status.autopilot is not None else "no autopilot heard"
-    lost = status.dropped_chunks + status.stale_ticks
-    return (
-        f"[bold]{health.state}[/]  x {x:6.2f}  y {y:6.2f} m  yaw {pose.yaw * 57.29578:6.1f} deg  "
-        f"sigma {sigma:.2f} m  sent {status.poses_sent}  {autopilot}" + (f"  dropped {lost}" if lost else "")
-    )
+    parts = [
+        f"[bold]{health.state}[/]",
+        f"x {x:6.2f}  y {y:6.2f} m  yaw {degrees(pose.yaw):6.1f} deg",
+        f"sigma {sigma:.2f} m",
+        f"sent {status.poses_sent}",
+        f"autopilot {status.autopilot}" if status.autopilot is not None else "no autopilot heard",
+    ]
+    if lost := status.dropped_chunks + status.stale_ticks:
+        parts.append(f"dropped {lost}")
+    if health.reason:
+        parts.append(health.reason)
+    return "  ".join(parts)

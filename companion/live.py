@@ -79,6 +79,7 @@ class LiveRun:
         self._period_ns = round(1e9 / config.pipeline.rate)
         self._chain = Chain(config, start_ns, make_pipeline(config, [self._primary]), self._primary)
         self._ports = {name: self._make_port(name, table) for name, table in config.sensor.items()}
+        self._open_sensors: set[str] = set()
         self._session = MavlinkSession(config.mavlink, config.map_heading())
 
     def run(self, stop: threading.Event) -> None:
@@ -122,8 +123,8 @@ class LiveRun:
     def _take(self, event: PortEvent) -> None:
         if isinstance(event, PortStatus):
             self._say(f"{event.name}: {event.message}")
-            if event.is_open and event.name in self._chain.sensors:
-                self._chain.sensors[event.name].connected(event.stamp_ns)
+            if event.name in self._chain.sensors:
+                self._set_open(event)
             return
         chunk = RawChunk(event.name, Direction.IN, event.stamp_ns, event.data)
         self._log.raw(chunk)
@@ -131,6 +132,13 @@ class LiveRun:
             self._session.receive(event.data)
             self.status.autopilot = self._session.autopilot
         self._work(self._chain.feed(chunk))
+
+    def _set_open(self, status: PortStatus) -> None:
+        if status.is_open:
+            self._open_sensors.add(status.name)
+            self._chain.sensors[status.name].connected(status.stamp_ns)
+        else:
+            self._open_sensors.discard(status.name)
 
     def _work(self, ticks: Iterable[Tick]) -> None:
         for tick in ticks:
@@ -158,7 +166,8 @@ class LiveRun:
 
     def _talk_to_devices(self) -> None:
         for name, sensor in self._chain.sensors.items():
-            self._send(name, sensor.poll(time.monotonic_ns()))
+            if name in self._open_sensors:
+                self._send(name, sensor.poll(time.monotonic_ns()))
 
     def _send(self, name: str, data: bytes) -> None:
         if data and self._ports[name].write(data):
