@@ -134,7 +134,14 @@ class HealthTable(Table):
         1.0, gt=0, le=60, description="degraded when no LiDAR increment was accepted for so long [s]"
     )
     min_accepted_share: float = Field(
-        0.25, ge=0, le=1, description="lost when a smaller share of recent ranges agrees with the pose"
+        0.3, ge=0, le=0.6, description="lost when a smaller share of recent ranges agrees with the pose"
+    )
+    max_short_share: float = Field(
+        0.03,
+        gt=0,
+        le=1,
+        description="lost when a larger share of recent ranges is gated as too short: what blocks a range "
+        "only lengthens it, so the pose must be wrong",
     )
 
 

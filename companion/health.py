@@ -10,7 +10,9 @@ from estimators.base import Report, Verdict
 from estimators.messages import Measurement, PoseEstimate, PoseIncrement, RangeFrame, measurement_stamp_ns
 
 MEMORY = 2.0
-"""Time constant [s] over which the share of accepted ranges is remembered."""
+"""Time constant [s] over which the shares of accepted and of too short ranges are remembered."""
+REGAIN = 1.5
+"""Agreement of ranges and pose must be better by this factor to be reached than to be kept."""
 
 
 class State(StrEnum):
@@ -68,6 +70,8 @@ class HealthMonitor:
         self._has_scans = has_scans
         # Nothing is believed before ranges have agreed with the start pose for a while.
         self._accepted_share = 0.0
+        self._short_share = 0.0
+        self._agrees = False
         self._has_agreed = False
         self._share_stamp_ns: int | None = None
         self._range_ns: int | None = None
@@ -84,16 +88,37 @@ class HealthMonitor:
             if good and measurement.from_stamp_ns < measurement.stamp_ns:
                 self._increment_ns = stamp_ns
             return
-        judged = good + sum(verdict is Verdict.GATED for verdict in report.verdicts)
-        if not isinstance(measurement, RangeFrame) or not judged:
+        if not isinstance(measurement, RangeFrame):
+            return
+        gated = [i for i, verdict in enumerate(report.verdicts) if verdict is Verdict.GATED]
+        judged = good + len(gated)
+        if not judged:
             return
         if good:
             self._range_ns = stamp_ns
+        # An estimator may gate without saying by how much.
+        too_short = int(np.count_nonzero(report.residuals[gated] < 0.0)) if len(report.residuals) else 0
         dt = 0.0 if self._share_stamp_ns is None else (stamp_ns - self._share_stamp_ns) * 1e-9
-        keep = np.exp(-dt / MEMORY)
-        self._accepted_share = float(keep * self._accepted_share + (1.0 - keep) * good / judged)
+        keep = float(np.exp(-dt / MEMORY))
+        self._accepted_share = keep * self._accepted_share + (1.0 - keep) * good / judged
+        self._short_share = keep * self._short_share + (1.0 - keep) * too_short / judged
         self._share_stamp_ns = stamp_ns
-        self._has_agreed |= self._accepted_share >= self._table.min_accepted_share
+        self._judge_agreement()
+
+    def _judge_agreement(self) -> None:
+        """Whether ranges and pose agree; harder to reach than to keep, so that health does not flicker."""
+        table = self._table
+        if self._agrees:
+            self._agrees = (
+                self._accepted_share >= table.min_accepted_share
+                and self._short_share <= table.max_short_share
+            )
+        else:
+            self._agrees = (
+                self._accepted_share >= REGAIN * table.min_accepted_share
+                and self._short_share <= table.max_short_share / REGAIN
+            )
+        self._has_agreed |= self._agrees
 
     def judge(self, pose: PoseEstimate | None, now_ns: int) -> Health:
         """State at `now_ns` for the pose that would be sent."""
@@ -118,7 +143,7 @@ class HealthMonitor:
             return Health(
                 State.LOST, f"heading sigma {sigma_yaw:.0f} deg above {table.max_sigma_yaw_deg:g} deg"
             )
-        if self._has_ranges and self._accepted_share < table.min_accepted_share:
+        if self._has_ranges and not self._agrees:
             return self._disagreement()
         stale = [f"no {s.what} accepted for {s.age:.1f} s" for s in sources if s.is_stale]
         if len(stale) == len(sources):
@@ -128,10 +153,13 @@ class HealthMonitor:
     def _disagreement(self) -> Health:
         if self._share_stamp_ns is None:
             return Health(State.STARTING, "no range yet that could confirm the start pose")
-        share = f"{self._accepted_share:.0%} of recent ranges agree with the pose"
+        shares = (
+            f"{self._accepted_share:.0%} of recent ranges agree with the pose, "
+            f"{self._short_share:.0%} are too short for it"
+        )
         if self._has_agreed:
-            return Health(State.LOST, f"only {share}")
-        return Health(State.STARTING, f"{share}; is the robot on its start mark?")
+            return Health(State.LOST, shares)
+        return Health(State.STARTING, f"{shares}; is the robot on its start mark?")
 
     def _sources(self, now_ns: int) -> list[_Source]:
         def source(what: str, seen_ns: int | None, limit: float) -> _Source:

@@ -101,6 +101,32 @@ def test_a_few_blocked_anchors_are_no_alarm() -> None:
     assert state(monitor_at(20.0, good=2), 20.0, pose()) is State.OK
 
 
+@pytest.mark.parametrize(("residual", "expected"), [(0.8, State.OK), (-0.8, State.LOST)])
+def test_a_range_that_is_too_short_is_an_alarm_where_a_long_one_is_none(
+    residual: float, expected: State
+) -> None:
+    monitor = monitor_at(5.0)
+    verdicts = (*(Verdict.ACCEPTED,) * 3, Verdict.GATED)
+    report = Report(verdicts, np.array([0.0, 0.0, 0.0, residual]), np.zeros(4))
+    for stamp_ns in range(5 * SECOND, 6 * SECOND, SECOND // 10):
+        monitor.observe(ranges(stamp_ns), report)
+        monitor.observe(increment(stamp_ns), Report((Verdict.ACCEPTED,)))
+    assert state(monitor, 6.0, pose()) is expected
+
+
+def test_a_lost_pose_must_agree_better_than_one_that_is_kept() -> None:
+    # Two of five: enough to go on, not enough to begin.
+    verdicts = (*(Verdict.ACCEPTED,) * 2, *(Verdict.GATED,) * 3)
+    kept, lost = monitor_at(5.0), monitor_at(5.0)
+    go_on(lost, 5, 15, Verdict.GATED)
+    for monitor, begin in ((kept, 5), (lost, 15)):
+        for stamp_ns in range(begin * SECOND, (begin + 20) * SECOND, SECOND // 10):
+            monitor.observe(ranges(stamp_ns), Report(verdicts))
+            monitor.observe(increment(stamp_ns), Report((Verdict.ACCEPTED,)))
+    assert state(kept, 25.0, pose()) is State.OK
+    assert state(lost, 35.0, pose()) is State.LOST
+
+
 def test_lost_when_the_covariance_says_so() -> None:
     wide = np.eye(6) * 0.01
     wide[0, 0] = wide[1, 1] = wide[0, 1] = wide[1, 0] = 0.2
