@@ -40,6 +40,9 @@ class Direction(StrEnum):
     OUT = "out"
 
 
+_DIRECTIONS = frozenset(direction.value for direction in Direction)
+
+
 @dataclass(frozen=True, slots=True)
 class RawChunk:
     """Bytes of one read from, or one write to, a port.
@@ -164,7 +167,7 @@ class Log:
 
     def _decode(self, topic: str, message: Message) -> Iterator[RawChunk | Truth]:
         parts = topic.split("/")
-        if len(parts) == 4 and parts[1] == "raw":
+        if len(parts) == 4 and parts[1] == "raw" and parts[3] in _DIRECTIONS:
             yield RawChunk(parts[2], Direction(parts[3]), message.log_time, message.data)
         elif topic == TRUTH_TOPIC:
             try:

@@ -4,7 +4,9 @@ import os
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pytest
@@ -59,6 +61,16 @@ def test_other_mcap_readers_understand_it(tmp_path: Path) -> None:
     with (tmp_path / "a.mcap").open("rb") as file:
         messages = [(c.topic, m.log_time, m.data) for _, c, m in make_reader(file).iter_messages()]
     assert messages == [("/raw/uwb/in", 7, b"bytes")]
+
+
+def test_topics_that_are_not_ours_are_passed_over(tmp_path: Path) -> None:
+    ours = RawChunk("uwb", Direction.IN, 7, b"bytes")
+    writer = LogWriter(tmp_path / "a.mcap", "", 0)
+    writer.raw(replace(ours, direction=cast("Direction", "sideways")))
+    writer.raw(replace(ours, source="a/b"))
+    writer.raw(ours)
+    writer.close()
+    assert list(Log(tmp_path / "a.mcap")) == [ours]
 
 
 WRITER = """
