@@ -244,7 +244,7 @@ def config_from_toml(text: str, origin: str, sets: Sequence[str] = ()) -> Config
 
 
 def default_toml() -> str:
-    """Every key that has a default, with it; what a site file must give itself is named in comments."""
+    """Every key that has a default, with it; what only a site file can give is left out."""
     anchors = {0: (0.0, 0.0, 2.0), 1: (0.0, 5.0, 2.0), 2: (5.0, 0.0, 2.0)}
     start = {"x": 0, "y": 0, "yaw_deg": 0}
     sensors = {driver: {"driver": driver, "port": "/dev/ttyUSB0"} for driver in SENSORS}

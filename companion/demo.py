@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from companion.log import Direction, Log, LogWriter, RawChunk, Truth
+from companion.log import Direction, Log, LogWriter, RawChunk
 from companion.mavlink.link import NAME as MAVLINK
 from companion.mavlink.pose_out import to_ned
 from companion.mavlink.session import MavlinkSession
@@ -16,7 +16,7 @@ from companion.replay import Replay, config_of, replay, write_outputs
 from companion.rerun_view import RerunView
 from companion.sim.autopilot import EmulatedAutopilot
 from companion.sim.scenario import Scenario
-from companion.sim.simulate import START_NS, converse
+from companion.sim.simulate import START_NS, record
 
 ESTIMATORS_COMPARED = ("ekf", "least_squares", "lidar_odometry")
 
@@ -94,17 +94,11 @@ def _fly(scenario: Scenario, path: Path, autopilot: EmulatedAutopilot) -> Iterat
             writer.raw(RawChunk(MAVLINK, Direction.OUT, tick.stamp_ns, data))
             autopilot.feed(data)
 
-    try:
-        for record in converse(scenario, chain.sensors):
-            if isinstance(record, Truth):
-                writer.truth(record)
-                yield (record.stamp_ns - START_NS) * 1e-9 / scenario.trajectory.duration
-            else:
-                writer.raw(record)
-                for tick in chain.feed(record):
-                    give_out(tick)
-    finally:
-        writer.close()
+    def take(chunk: RawChunk) -> None:
+        for tick in chain.feed(chunk):
+            give_out(tick)
+
+    return record(scenario, chain.sensors, writer, take)
 
 
 def _received(autopilot: EmulatedAutopilot, result: Replay) -> Received:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from companion.log import Truth
+from estimators.geometry import wrap_angles
 from estimators.messages import FloatArray, PoseEstimate
 
 
@@ -136,13 +137,12 @@ def compare(poses: Sequence[PoseEstimate], reference: Reference, ticks_with_trut
     estimated = np.array([[*pose.xy, pose.yaw] for pose in covered]).reshape(-1, 3)
     truth = reference.at(stamps) if covered else np.empty((0, 3))
     error = estimated - truth
-    error[:, 2] = (error[:, 2] + np.pi) % (2.0 * np.pi) - np.pi
-    rows = np.ix_([0, 1, 5], [0, 1, 5])
+    error[:, 2] = wrap_angles(error[:, 2])
     return Errors(
         stamps_ns=np.array(stamps, dtype=np.int64),
         pose=estimated,
         truth=truth,
         error=error,
-        cov=np.array([pose.cov[rows] for pose in covered]).reshape(-1, 3, 3),
+        cov=np.array([pose.planar_cov for pose in covered]).reshape(-1, 3, 3),
         availability=len(covered) / ticks_with_truth if ticks_with_truth else 0.0,
     )

@@ -19,7 +19,7 @@ class State(StrEnum):
     """How far the pose can be trusted."""
 
     STARTING = "starting"
-    """No pose yet."""
+    """No pose yet, or none that ranges have confirmed; not sent."""
     OK = "ok"
     DEGRADED = "degraded"
     """A sensor is missing; the pose is still sent, with the covariance that it then has."""

@@ -1,8 +1,8 @@
 """The one path from bytes to poses, shared by live runs, replay, simulation and tests.
 
-`Pipeline.step` and `Chain.tick` are pure: no clock, no thread, no I/O. Whoever calls them says what time
-it is. Poses are given at fixed instants (ticks) counted from the start of the run, so a replay of the
-log asks for exactly the poses that the live run gave.
+`Pipeline.step`, `Chain.feed` and `Chain.advance` are pure: no clock, no thread, no I/O. Whoever calls them
+says what time it is. Poses are given at fixed instants (ticks) counted from the start of the run, so a
+replay of the log asks for exactly the poses that the live run gave.
 """
 
 from collections.abc import Iterator, Mapping
@@ -45,7 +45,7 @@ class Tick:
         stamp_ns: the instant.
         outcomes: measurements processed since the tick before.
         poses: estimator name -> pose at `stamp_ns`, None while it has none.
-        health: judgement of the first estimator's pose.
+        health: judgement of the primary estimator's pose.
     """
 
     stamp_ns: int
@@ -91,14 +91,12 @@ class Chain:
     Args:
         config: of the site.
         start_ns: time of the first tick.
-        pipeline: front end and estimators, the one whose pose is sent first.
+        pipeline: front end and estimators.
         primary: name of the estimator whose pose is judged and sent.
     """
 
     def __init__(self, config: Config, start_ns: int, pipeline: Pipeline, primary: str) -> None:
-        self.sensors: dict[str, Sensor] = {
-            name: make_sensor(table.driver, table.settings) for name, table in config.sensor.items()
-        }
+        self.sensors = make_sensors(config)
         self.sequencer = Sequencer(round(config.pipeline.hold_ms * 1e6))
         self._pipeline = pipeline
         self._primary = primary
@@ -137,10 +135,18 @@ class Chain:
         return Tick(stamp_ns, outcomes, poses, self._monitor.judge(poses[self._primary], stamp_ns))
 
 
-def make_pipeline(config: Config, names: list[str]) -> Pipeline:
+def make_sensors(config: Config) -> dict[str, Sensor]:
+    """A driver for every sensor of the site, by its name."""
+    return {name: make_sensor(table.driver, table.settings) for name, table in config.sensor.items()}
+
+
+def make_parts(config: Config, names: list[str]) -> tuple[FrontEnd, dict[str, Estimator]]:
     """Front end and the named estimators with the site's settings."""
     setup = config.setup()
-    return Pipeline(
-        ScanMatcher(config.scan_matcher, config.lidar_mounting()),
-        {name: make_estimator(name, config.estimator_config(name), setup) for name in names},
-    )
+    front_end = ScanMatcher(config.scan_matcher, config.lidar_mounting())
+    return front_end, {name: make_estimator(name, config.estimator_config(name), setup) for name in names}
+
+
+def make_pipeline(config: Config, names: list[str]) -> Pipeline:
+    """Pipeline of these parts."""
+    return Pipeline(*make_parts(config, names))

@@ -14,11 +14,9 @@ from companion.config import Config, config_from_toml
 from companion.errors import UserError
 from companion.evaluate import Accuracy, Errors, Reference, compare
 from companion.log import Log, Truth
-from companion.pipeline import Chain, Pipeline, Tick
+from companion.pipeline import Chain, FrontEnd, Pipeline, Tick, make_parts
 from drivers.framing import DecodeStats
-from estimators import make_estimator
 from estimators.base import Estimator, Report, Verdict
-from estimators.lidar.scan_matching import ScanMatcher
 from estimators.messages import Measurement, PoseEstimate, PoseIncrement, RangeFrame, Scan
 
 
@@ -33,6 +31,11 @@ class Stopwatch:
     def mean_ms(self) -> float:
         """Mean time of a call [ms]."""
         return 1e3 * self.seconds / self.calls if self.calls else 0.0
+
+    def note(self, begin: float) -> None:
+        """Count a call that began at `begin` of `time.perf_counter` and is over now."""
+        self.seconds += time.perf_counter() - begin
+        self.calls += 1
 
 
 class _TimedEstimator:
@@ -49,24 +52,24 @@ class _TimedEstimator:
         begin = time.perf_counter()
         report = self._estimator.update(measurement)
         if Verdict.NOT_USED not in report.verdicts:
-            self._stopwatch.seconds += time.perf_counter() - begin
-            self._stopwatch.calls += 1
+            self._stopwatch.note(begin)
         return report
 
     def pose_at(self, stamp_ns: int) -> PoseEstimate | None:
         return self._estimator.pose_at(stamp_ns)
 
 
-class _TimedMatcher(ScanMatcher):
-    """A scan matcher that is timed."""
+class _TimedFrontEnd:
+    """A front end whose updates are timed."""
 
-    stopwatch: Stopwatch
+    def __init__(self, front_end: FrontEnd, stopwatch: Stopwatch) -> None:
+        self._front_end = front_end
+        self._stopwatch = stopwatch
 
     def update(self, scan: Scan) -> PoseIncrement | None:
         begin = time.perf_counter()
-        increment = super().update(scan)
-        self.stopwatch.seconds += time.perf_counter() - begin
-        self.stopwatch.calls += 1
+        increment = self._front_end.update(scan)
+        self._stopwatch.note(begin)
         return increment
 
 
@@ -231,15 +234,8 @@ def summary(result: Replay) -> dict[str, object]:
 
 
 def _timed_pipeline(config: Config, names: list[str], update_times: dict[str, Stopwatch]) -> Pipeline:
-    matcher = _TimedMatcher(config.scan_matcher, config.lidar_mounting())
-    matcher.stopwatch = update_times["scan_matcher"]
-    setup = config.setup()
+    front_end, estimators = make_parts(config, names)
     return Pipeline(
-        matcher,
-        {
-            name: _TimedEstimator(
-                make_estimator(name, config.estimator_config(name), setup), update_times[name]
-            )
-            for name in names
-        },
+        _TimedFrontEnd(front_end, update_times["scan_matcher"]),
+        {name: _TimedEstimator(estimator, update_times[name]) for name, estimator in estimators.items()},
     )

@@ -26,6 +26,7 @@ from companion.log import Truth
 from companion.pipeline import Tick
 from companion.rerun_layout import TIMELINE, blueprint
 from estimators.base import Report, Verdict
+from estimators.geometry import transform_each, wrap_angles
 from estimators.messages import FloatArray, IntArray, RangeFrame, Scan
 
 # RGBA after Okabe and Ito: told apart by colour-blind eyes too, and bright enough on a dark ground.
@@ -138,11 +139,12 @@ class RerunView:
             self._static(f"ranges/nis/{name}", style)
 
     def _send_run(self) -> None:
+        reference = Reference(self._truths)
         others = [name for name in self._ticks[0].poses if name != self._primary]
         for name, colour in zip(others, cycle(_OTHER_ESTIMATORS), strict=False):
-            self._send_estimate(name, _track(self._ticks, name), colour, 20.0)
+            self._send_estimate(name, _track(self._ticks, name), reference, colour, 20.0)
         track = _track(self._ticks, self._primary)
-        distance, yaw = self._send_estimate(self._primary, track, _SKY, 40.0)
+        distance, yaw = self._send_estimate(self._primary, track, reference, _SKY, 40.0)
         self._send_covariance(track, distance, yaw)
         self._send_scans(track)
         if self._frames:
@@ -155,17 +157,16 @@ class RerunView:
             self._send_track("map/truth", _Track(truth_ns, pose, np.empty((0, 3, 3))), _WHITE, 30.0)
 
     def _send_estimate(
-        self, name: str, track: _Track, colour: int, layer: float
+        self, name: str, track: _Track, reference: Reference, colour: int, layer: float
     ) -> tuple[FloatArray, FloatArray]:
         """Track and errors; gives those in position [m] and heading [deg], (N,), NaN where not known."""
         self._send_track(f"map/estimate/{name}", track, colour, layer)
-        reference = Reference(self._truths)
         error = np.full(track.pose.shape, np.nan)
         covered = np.array([reference.covers(stamp_ns) for stamp_ns in track.stamps_ns.tolist()])
         if covered.any():
             error[covered] = track.pose[covered] - reference.at(track.stamps_ns[covered].tolist())
         distance = np.hypot(error[:, 0], error[:, 1])
-        yaw = np.rad2deg((error[:, 2] + np.pi) % (2.0 * np.pi) - np.pi)
+        yaw = np.rad2deg(wrap_angles(error[:, 2]))
         self._series(f"error/position/{name}", name, colour, track.stamps_ns, distance)
         self._series(f"error/yaw/{name}", name, colour, track.stamps_ns, yaw)
         return distance, yaw
@@ -237,7 +238,7 @@ class RerunView:
         lidar_x, lidar_y, lidar_yaw = self._config.lidar_mounting()
         angles = np.concatenate([scan.angles for scan in scans]) + lidar_yaw
         p_body = np.column_stack([lidar_x + ranges * np.cos(angles), lidar_y + ranges * np.sin(angles)])
-        p_map = _to_map(track.at(beam_ns), p_body)
+        p_map = transform_each(track.at(beam_ns), p_body)
         drawn = (ranges > 0.0) & np.isfinite(p_map).all(axis=1)
         style = rr.Points2D.from_fields(colors=_LIGHT, radii=_screen(1.5), draw_order=15.0)
         self._static("map/scan", style)
@@ -256,7 +257,7 @@ class RerunView:
         # An estimator without use for ranges gives one verdict for the whole frame.
         verdicts = [v for (_, r), n in zip(self._frames, counts, strict=True) for v in (r.verdicts * n)[:n]]
         pose = track.at(stamps_ns)[row]
-        tag = _to_map(pose, np.array([self._config.body.tag[:2]]))
+        tag = transform_each(pose, np.array([self._config.body.tag[:2]]))
         # Where the heading is not known, the lever arm of the tag is left out.
         tag = np.where(np.isfinite(tag), tag, pose[:, :2])
         lines = np.stack([tag, anchors[:, :2]], axis=1)
@@ -328,23 +329,14 @@ class RerunView:
 def _track(ticks: list[Tick], name: str) -> _Track:
     """One estimator's poses at all ticks; a pose that holds a NaN counts as none."""
     pose, cov = np.full((len(ticks), 3), np.nan), np.full((len(ticks), 3, 3), np.nan)
-    planar = np.ix_([0, 1, 5], [0, 1, 5])
     for i, tick in enumerate(ticks):
         estimate = tick.poses[name]
         if estimate is not None and np.isfinite(estimate.T_map_body).all():
-            pose[i], cov[i] = (*estimate.xy, estimate.yaw), estimate.cov[planar]
+            pose[i], cov[i] = (*estimate.xy, estimate.yaw), estimate.planar_cov
     pose[~np.isfinite(cov[:, 2, 2]), 2] = np.nan
     known = np.isfinite(pose[:, 2])
     pose[known, 2] = np.unwrap(pose[known, 2])
     return _Track(np.array([tick.stamp_ns for tick in ticks]), pose, cov)
-
-
-def _to_map(T_map_body: FloatArray, p_body: FloatArray) -> FloatArray:
-    """Points (N, 2) or (1, 2) of the body frame in the map, each from its own pose (N, 3)."""
-    x, y, yaw = T_map_body.T
-    c, s = np.cos(yaw), np.sin(yaw)
-    p_x, p_y = p_body.T
-    return np.column_stack([x + c * p_x - s * p_y, y + s * p_x + c * p_y])
 
 
 def _screen(points: float) -> float:

@@ -6,7 +6,7 @@ from typing import Protocol
 
 import numpy as np
 
-from estimators.messages import FloatArray, Measurement, PoseEstimate
+from estimators.messages import PLANAR, FloatArray, Measurement, PoseEstimate
 
 
 class Verdict(StrEnum):
@@ -91,8 +91,7 @@ class Setup:
     def lift_covariance(self, planar: FloatArray) -> FloatArray:
         """Covariance (6, 6) of PoseEstimate from that of (x, y, yaw), (3, 3)."""
         cov = np.zeros((6, 6))
-        rows = np.array([0, 1, 5])
-        cov[np.ix_(rows, rows)] = planar
+        cov[PLANAR] = planar
         cov[2, 2] = self.height_sigma**2
         cov[3, 3] = cov[4, 4] = self.level_sigma**2
         return cov

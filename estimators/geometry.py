@@ -4,7 +4,7 @@
 Conventions follow the README's frame table: right-handed, z up, angles counter-clockwise.
 """
 
-from math import cos, remainder, sin, tau
+from math import cos, pi, remainder, sin, tau
 
 import numpy as np
 
@@ -14,6 +14,11 @@ from estimators.messages import FloatArray
 def wrap_angle(angle: float) -> float:
     """Angle [rad] brought into [-pi, pi]."""
     return remainder(angle, tau)
+
+
+def wrap_angles(angles: FloatArray) -> FloatArray:
+    """Angles (N,) [rad] brought into [-pi, pi)."""
+    return (angles + pi) % tau - pi
 
 
 def rotation(yaw: float) -> FloatArray:
@@ -91,6 +96,13 @@ def _arc(yaw: float) -> tuple[float, float]:
 def transform(T_a_b: FloatArray, points_b: FloatArray) -> FloatArray:
     """Points (N, 2) of frame b in frame a."""
     return points_b @ rotation(T_a_b[2]).T + T_a_b[:2]
+
+
+def transform_each(T_a_b: FloatArray, points_b: FloatArray) -> FloatArray:
+    """Points in frame a, (N, 2), each by its own pose (N, 3); one point (1, 2) goes through all of them."""
+    c, s = np.cos(T_a_b[:, 2]), np.sin(T_a_b[:, 2])
+    x, y = points_b.T
+    return np.column_stack([T_a_b[:, 0] + c * x - s * y, T_a_b[:, 1] + s * x + c * y])
 
 
 def lift(planar: FloatArray, z: float) -> FloatArray:

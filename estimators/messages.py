@@ -113,6 +113,10 @@ class PoseIncrement:
     is_keyframe: bool
 
 
+PLANAR = np.ix_([0, 1, 5], [0, 1, 5])
+"""Rows and columns of (x, y, yaw) in the covariance of a PoseEstimate."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseEstimate:
     """Pose of the body in the map with its uncertainty.
@@ -139,6 +143,11 @@ class PoseEstimate:
     def yaw(self) -> float:
         """Heading [rad], counter-clockwise from the map's x axis."""
         return float(np.arctan2(self.T_map_body[1, 0], self.T_map_body[0, 0]))
+
+    @property
+    def planar_cov(self) -> FloatArray:
+        """Covariance of (x, y, yaw), (3, 3)."""
+        return self.cov[PLANAR]
 
 
 Measurement: TypeAlias = RangeFrame | Scan | ImuSample | Attitude | PoseIncrement

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from pymavlink.dialects.v20 import common as mavlink2
 
+from estimators.geometry import wrap_angle
 from estimators.messages import FloatArray, PoseEstimate
 
 _UPPER = np.triu_indices(6)
@@ -43,7 +44,7 @@ def to_ned(estimate: PoseEstimate, map_heading: float) -> NedPose:
     R = estimate.T_map_body[:3, :3]
     roll = np.arctan2(R[2, 1], R[2, 2])
     pitch = np.arcsin(np.clip(-R[2, 0], -1.0, 1.0))
-    yaw = (map_heading - estimate.yaw + np.pi) % (2.0 * np.pi) - np.pi
+    yaw = wrap_angle(map_heading - estimate.yaw)
     jacobian = np.zeros((6, 6))
     jacobian[:3, :3] = R_ned_map
     jacobian[3:, 3:] = np.diag([1.0, -1.0, -1.0])
@@ -74,4 +75,15 @@ def vision_position_estimate(
         *ned.roll_pitch_yaw.tolist(),
         covariance=ned.cov[_UPPER].tolist(),
         reset_counter=estimate.reset_counter % 256,
+    )
+
+
+def ned_pose(message: mavlink2.MAVLink_vision_position_estimate_message) -> NedPose:
+    """The pose that a VISION_POSITION_ESTIMATE carries, as the autopilot reads it."""
+    cov: FloatArray = np.zeros((6, 6))
+    cov[_UPPER] = message.covariance
+    return NedPose(
+        np.array([message.x, message.y, message.z]),
+        np.array([message.roll, message.pitch, message.yaw]),
+        cov + np.triu(cov, 1).T,
     )

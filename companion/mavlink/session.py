@@ -39,15 +39,17 @@ class MavlinkSession:
 
     def receive(self, data: bytes) -> None:
         """Take bytes from the link; our system id follows the first autopilot heard."""
+        if self.autopilot is not None:
+            return
         for message in self._parser.parse_buffer(data) or []:
             if (
-                self.autopilot is None
-                and message.get_type() == "HEARTBEAT"
+                message.get_type() == "HEARTBEAT"
                 and message.get_srcComponent() == mavlink2.MAV_COMP_ID_AUTOPILOT1
                 and message.autopilot != mavlink2.MAV_AUTOPILOT_INVALID
             ):
                 self.autopilot = message.get_srcSystem()
                 self._packer.srcSystem = self.autopilot
+                return
 
     def tick(self, pose: PoseEstimate | None, health: Health, now_ns: int) -> bytes:
         """Bytes to send at `now_ns`: a heartbeat when it is due, the pose when it may be sent."""

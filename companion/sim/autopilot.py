@@ -1,15 +1,12 @@
 """An autopilot that listens: HEARTBEAT out, everything we send parsed by pymavlink's own parser."""
 
-import numpy as np
 from pymavlink.dialects.v20 import common as mavlink2
 
-from companion.mavlink.pose_out import NedPose
-from estimators.messages import FloatArray
+from companion.mavlink.pose_out import NedPose, ned_pose
 
 SYSTEM_ID = 7
 """Not 1, so that taking over the autopilot's system id shows."""
 _PERIOD_NS = 1_000_000_000
-_UPPER = np.triu_indices(6)
 
 
 class EmulatedAutopilot:
@@ -49,14 +46,3 @@ class EmulatedAutopilot:
                     message.type == mavlink2.MAV_TYPE_ONBOARD_CONTROLLER
                     and message.autopilot == mavlink2.MAV_AUTOPILOT_INVALID
                 )
-
-
-def ned_pose(message: mavlink2.MAVLink_vision_position_estimate_message) -> NedPose:
-    """The pose that a VISION_POSITION_ESTIMATE carries."""
-    cov: FloatArray = np.zeros((6, 6))
-    cov[_UPPER] = message.covariance
-    return NedPose(
-        np.array([message.x, message.y, message.z]),
-        np.array([message.roll, message.pitch, message.yaw]),
-        cov + np.triu(cov, 1).T,
-    )

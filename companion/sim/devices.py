@@ -28,7 +28,7 @@ from drivers.rplidar_protocol import (
     encode_express_capsule,
     encode_standard_node,
 )
-from estimators.geometry import transform, wrap_angle
+from estimators.geometry import transform, transform_each, wrap_angle
 from estimators.messages import FloatArray
 
 GRAVITY = 9.81
@@ -263,13 +263,7 @@ class RplidarDevice:
         since_scan = turns / self._lidar.rotation_hz
         times = np.asarray(since_scan + self._robot.seconds(self._scan_begin_ns), dtype=np.float64)
         pose = self._robot.scenario.trajectory.at(times).pose
-        c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
-        origins = pose[:, :2] + np.column_stack(
-            [
-                c * self._mounting[0] - s * self._mounting[1],
-                s * self._mounting[0] + c * self._mounting[1],
-            ]
-        )
+        origins = transform_each(pose, self._mounting[None, :2])
         beams = pose[:, 2] + self._mounting[2] - np.deg2rad(directions)
         distances = self._robot.scenario.world.ray_cast(origins, beams, self._height)
         distances = distances + self._rng.standard_normal(count) * self._lidar.sigma

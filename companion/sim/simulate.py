@@ -1,12 +1,12 @@
 """Emulated devices and real drivers joined in memory, in simulated time."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 from companion.log import Direction, LogWriter, RawChunk, Truth
+from companion.pipeline import make_sensors
 from companion.sim.devices import Robot, make_devices
 from companion.sim.scenario import Scenario
-from drivers import make_sensor
 from drivers.framing import Sensor
 from estimators.messages import Scan
 
@@ -50,6 +50,29 @@ def converse(scenario: Scenario, sensors: Mapping[str, Sensor]) -> Iterator[RawC
         now_ns += STEP_NS
 
 
+def record(
+    scenario: Scenario, sensors: Mapping[str, Sensor], writer: LogWriter, take: Callable[[RawChunk], None]
+) -> Iterator[float]:
+    """Carry a conversation out and log it; gives the share that is done, now and then, and closes the log.
+
+    Args:
+        scenario: to run.
+        sensors: the drivers, by the site's sensor names.
+        writer: gets everything before it is worked on.
+        take: must feed the incoming chunks to `sensors`.
+    """
+    try:
+        for item in converse(scenario, sensors):
+            if isinstance(item, Truth):
+                writer.truth(item)
+                yield (item.stamp_ns - START_NS) * 1e-9 / scenario.trajectory.duration
+            else:
+                writer.raw(item)
+                take(item)
+    finally:
+        writer.close()
+
+
 def simulate(scenario: Scenario, path: Path) -> Iterator[float]:
     """Write the log of a run without estimators; gives the share that is done, now and then.
 
@@ -60,18 +83,10 @@ def simulate(scenario: Scenario, path: Path) -> Iterator[float]:
     Raises:
         UserError: the log cannot be written.
     """
-    sensors = {
-        name: make_sensor(table.driver, table.settings) for name, table in scenario.config.sensor.items()
-    }
-    writer = LogWriter(path, scenario.config.to_toml(), START_NS)
-    try:
-        for record in converse(scenario, sensors):
-            if isinstance(record, Truth):
-                writer.truth(record)
-                yield (record.stamp_ns - START_NS) * 1e-9 / scenario.trajectory.duration
-            else:
-                writer.raw(record)
-                if record.direction is Direction.IN:
-                    sensors[record.source].feed(record.data, record.stamp_ns)
-    finally:
-        writer.close()
+    sensors = make_sensors(scenario.config)
+
+    def take(chunk: RawChunk) -> None:
+        if chunk.direction is Direction.IN:
+            sensors[chunk.source].feed(chunk.data, chunk.stamp_ns)
+
+    yield from record(scenario, sensors, LogWriter(path, scenario.config.to_toml(), START_NS), take)

@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from estimators.geometry import compose, rotation, wrap_angle
+from estimators.geometry import compose, rotation, wrap_angle, wrap_angles
 from estimators.messages import FloatArray
 
 
@@ -96,6 +96,7 @@ class Trajectory:
             length = float(np.hypot(*(path[i + 1] - path[i])))
             start = np.array([*path[i], heading])
             clock = self._append(_Leg(clock, start, length, speed, accel, False))
+        self._begins = np.array([leg.begin for leg in self._legs])
         self.duration = clock + rest
         """Time from the first rest to the end of the last [s]."""
 
@@ -108,8 +109,7 @@ class Trajectory:
         times = np.asarray(times, dtype=np.float64)
         pose = np.broadcast_to(self.start, (len(times), 3)).copy()
         yaw_rate, accel = np.zeros(len(times)), np.zeros(len(times))
-        begins = np.array([leg.begin for leg in self._legs])
-        leg_index = np.searchsorted(begins, times, side="right") - 1
+        leg_index = np.searchsorted(self._begins, times, side="right") - 1
         for index in np.unique(leg_index[leg_index >= 0]):
             here = leg_index == index
             leg = self._legs[int(index)]
@@ -132,5 +132,5 @@ class Trajectory:
         turn = self._placement[2]
         moved = np.empty_like(pose)
         moved[:, :2] = (pose[:, :2] - self.start[:2]) @ rotation(turn).T + real_start[:2]
-        moved[:, 2] = (pose[:, 2] + turn + np.pi) % (2.0 * np.pi) - np.pi
+        moved[:, 2] = wrap_angles(pose[:, 2] + turn)
         return moved

@@ -77,7 +77,7 @@ class LidarOdometry:
 
     @property
     def state(self) -> tuple[FloatArray, FloatArray]:
-        """State (9,) and covariance (9, 9) at the newest measurement, for tests and views."""
+        """State (9,) and covariance (9, 9) at the newest measurement, for tests."""
         return self._filter.x.copy(), self._filter.P.copy()
 
     def update(self, measurement: Measurement) -> Report:

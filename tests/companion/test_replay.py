@@ -121,12 +121,24 @@ def edited(source: Path, target: Path, keep: Callable[[RawChunk | Truth], RawChu
     return target
 
 
+def silent(
+    source: str, begin_ns: int, end_ns: int = 2**62
+) -> Callable[[RawChunk | Truth], RawChunk | Truth | None]:
+    """Leaves out what a sensor sent in some time."""
+
+    def keep(record: RawChunk | Truth) -> RawChunk | Truth | None:
+        is_its = isinstance(record, RawChunk) and record.source == source
+        return None if is_its and begin_ns <= record.stamp_ns < end_ns else record
+
+    return keep
+
+
 def test_without_lidar_it_says_so_and_stops_before_it_is_wrong(short_log: Path, tmp_path: Path) -> None:
     off_ns = 5_000_000_000
     path = edited(
         short_log,
         tmp_path / "dark.mcap",
-        lambda r: None if isinstance(r, RawChunk) and r.source == "lidar" and r.stamp_ns > off_ns else r,
+        silent("lidar", off_ns),
     )
     log = Log(path)
     config = config_of(log, [])
@@ -151,11 +163,7 @@ def test_after_a_gap_in_the_scans_no_wrong_heading_is_sent(
     path = edited(
         short_log,
         tmp_path / "gap.mcap",
-        lambda r: (
-            None
-            if isinstance(r, RawChunk) and r.source == "lidar" and 0 <= r.stamp_ns - begin_ns < off * 1e9
-            else r
-        ),
+        silent("lidar", begin_ns, begin_ns + round(off * 1e9)),
     )
     log = Log(path)
     sent: list[int] = []
@@ -178,7 +186,7 @@ def test_without_uwb_it_goes_on_and_says_so(short_log: Path, tmp_path: Path) -> 
     path = edited(
         short_log,
         tmp_path / "silent.mcap",
-        lambda r: None if isinstance(r, RawChunk) and r.source == "uwb" and r.stamp_ns > off_ns else r,
+        silent("uwb", off_ns),
     )
     result = run(path, ["ekf"])
     assert result.health["degraded"] > 100

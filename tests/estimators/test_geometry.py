@@ -16,7 +16,9 @@ from estimators.geometry import (
     logarithm,
     rotation,
     transform,
+    transform_each,
     wrap_angle,
+    wrap_angles,
 )
 from estimators.messages import FloatArray
 from tests.strategies import angles, coordinates, poses
@@ -130,3 +132,20 @@ def test_exponential_is_many_small_steps(twist: FloatArray) -> None:
 @given(st.floats(-1e-6, 1e-6), st.floats(-1e-6, 1e-6), st.floats(-1e-5, 1e-5))
 def test_exponential_near_the_identity(vx: float, vy: float, rate: float) -> None:
     np.testing.assert_allclose(exponential(np.array([vx, vy, rate])), [vx, vy, rate], atol=1e-11)
+
+
+@given(st.lists(poses, min_size=1, max_size=5), coordinates, coordinates)
+def test_transform_each_is_transform_pose_by_pose(many: list[FloatArray], x: float, y: float) -> None:
+    point = np.array([[x, y]])
+    expected = np.vstack([transform(pose, point) for pose in many])
+    np.testing.assert_allclose(transform_each(np.array(many), point), expected, atol=1e-9)
+    np.testing.assert_allclose(
+        transform_each(np.array(many), np.repeat(point, len(many), axis=0)), expected, atol=1e-9
+    )
+
+
+@given(st.lists(st.floats(-50.0, 50.0), min_size=1, max_size=5))
+def test_wrap_angles_is_wrap_angle_for_many(many: list[float]) -> None:
+    wrapped = wrap_angles(np.array(many))
+    assert ((wrapped >= -pi) & (wrapped < pi)).all()
+    np.testing.assert_allclose(np.exp(1j * wrapped), np.exp(1j * np.array([wrap_angle(a) for a in many])))

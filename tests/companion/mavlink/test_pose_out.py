@@ -7,8 +7,7 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import common as mavlink2
 from scipy.spatial.transform import Rotation
 
-from companion.mavlink.pose_out import to_ned, vision_position_estimate
-from companion.sim.autopilot import ned_pose
+from companion.mavlink.pose_out import ned_pose, to_ned, vision_position_estimate
 from estimators.geometry import lift
 from estimators.messages import FloatArray, PoseEstimate
 
