@@ -16,7 +16,7 @@ from drivers.linktrack import LinkTrack, measurements
 from drivers.linktrack_frames import Frame, NodeFrame2, NodeFrame3, NodeRange, TagFrame0, decode, encode
 from estimators.messages import Attitude, ImuSample, RangeFrame
 
-DATA = Path(__file__).parents[1] / "data" / "linktrack"
+DATA = Path(__file__).parents[1] / "data" / "vectors"
 
 KINDS: dict[str, type[Frame]] = {
     "tag_frame0": TagFrame0,
@@ -52,7 +52,7 @@ PEER_NAMES = {
 
 
 def load(name: str) -> Any:
-    return json.loads((DATA / f"{name}.json").read_text())
+    return json.loads((DATA / f"linktrack_{name}.json").read_text())
 
 
 def vectors(kind: str) -> list[dict[str, Any]]:
@@ -262,7 +262,7 @@ def test_the_longest_node_lists_fit() -> None:
 
 
 def listed_frames(name: str) -> tuple[bytes, list[dict[str, Any]]]:
-    return (DATA / f"{name}.bin").read_bytes(), load(name)["frames"]
+    return (DATA / f"linktrack_{name}.bin").read_bytes(), load(name)["frames"]
 
 
 @pytest.mark.parametrize("name", STREAMS)

@@ -33,7 +33,7 @@ from drivers.rplidar_protocol import (
 )
 from estimators.messages import FloatArray, Scan
 
-DATA = Path(__file__).parents[1] / "data" / "rplidar"
+DATA = Path(__file__).parents[1] / "data" / "vectors"
 MS = 1_000_000
 T0_NS = 5_000_000_000
 SAMPLE_NS = {"standard": 500_000, "express": 250_000}

@@ -35,7 +35,7 @@ from drivers.rplidar_protocol import (
     encode_standard_node,
 )
 
-DATA = Path(__file__).parents[1] / "data" / "rplidar"
+DATA = Path(__file__).parents[1] / "data" / "vectors"
 STREAMS = [
     "standard_clean",
     "standard_damaged",
