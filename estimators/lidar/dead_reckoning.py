@@ -15,7 +15,7 @@ class DeadReckoning:
     """Sum of the increments, and the covariance that they claim in sum.
 
     It is told the true start, so that all of its error is drift. Between increments it goes on with the
-    velocity of the last one.
+    velocity of the last one, and its covariance stays that of the increments.
 
     Args:
         setup: of the site; its start does not count.
