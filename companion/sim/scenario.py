@@ -5,10 +5,18 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, ValidationInfo, field_validator
 
 from companion.config import Config, Coordinate, Table, load_config, parse_toml, read_text, validated
 from companion.errors import UserError
+from companion.sim.gait import GaitTrajectory
+from companion.sim.scenario_tables import (
+    GaitTable,
+    IncrementsTable,
+    LandmarksTable,
+    PaperTable,
+    RandomBoxesTable,
+)
 from companion.sim.trajectory import Trajectory
 from companion.sim.world import World
 
@@ -26,6 +34,7 @@ class WorldTable(Table):
     """Obstacles; the walls are those of the site file."""
 
     boxes: list[BoxTable] = Field(default_factory=list)
+    random_boxes: list[RandomBoxesTable] = Field(default_factory=list)
 
 
 class TrajectoryTable(Table):
@@ -81,6 +90,17 @@ class ScenarioFile(Table):
     uwb: UwbTable = Field(default_factory=UwbTable)
     lidar: LidarTable = Field(default_factory=LidarTable)
     imu: ImuTable = Field(default_factory=ImuTable)
+    gait: GaitTable | None = None
+    increments: IncrementsTable | None = None
+    landmarks: LandmarksTable | None = None
+    paper: PaperTable | None = None
+
+    @field_validator("landmarks")
+    @classmethod
+    def _without_bytes(cls, landmarks: LandmarksTable, info: ValidationInfo) -> LandmarksTable:
+        if info.data.get("increments") is None:
+            raise ValueError("no emulated device sends landmarks, they need a table [increments]")
+        return landmarks
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -102,7 +122,7 @@ class Scenario:
     config: Config
     seed: int
     world: World
-    trajectory: Trajectory
+    trajectory: Trajectory | GaitTrajectory
     rng: np.random.Generator
 
 
@@ -119,7 +139,7 @@ def load_scenario(path: Path, seed: int | None, sets: list[str]) -> Scenario:
     """
     file = validated(ScenarioFile, parse_toml(read_text(path), str(path)), str(path))
     config = load_config(path.parent / file.site, sets)
-    if len(config.site.walls) == 0 and not file.world.boxes:
+    if not (config.site.walls or file.world.boxes or file.world.random_boxes):
         raise UserError(f"{path}: the site has no walls and the scenario no boxes, the LiDAR sees nothing")
     walk = file.trajectory
     start = config.setup().start
@@ -128,7 +148,7 @@ def load_scenario(path: Path, seed: int | None, sets: list[str]) -> Scenario:
     boxes = [(*b.centre, *b.size, float(np.deg2rad(b.yaw_deg)), b.height) for b in file.world.boxes]
     # The operator sets the robot down on its mark as well as the site file says, not better.
     placement = rng.standard_normal(3) * start.sigma
-    trajectory = Trajectory(
+    straight = Trajectory(
         walk.waypoints,
         walk.laps,
         walk.speed,
@@ -137,6 +157,9 @@ def load_scenario(path: Path, seed: int | None, sets: list[str]) -> Scenario:
         walk.rest,
         placement,
     )
+    for table in file.world.random_boxes:
+        boxes += table.draw(rng)
+    trajectory = GaitTrajectory(straight, walk.rest, file.gait, rng) if file.gait else straight
     if not np.allclose(trajectory.start, start.pose, atol=1e-3):
         x, y, yaw = trajectory.start
         raise UserError(
