@@ -21,6 +21,7 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 from companion import __version__
 from companion.config import default_toml, load_config, params_dir
 from companion.errors import UserError
+from companion.evaluate_cli import app as evaluate_app
 
 if TYPE_CHECKING:
     from companion.live import LiveRun, LiveStatus
@@ -38,6 +39,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     add_completion=False,
 )
+app.add_typer(evaluate_app, name="evaluate")
 out = Console()
 err = Console(stderr=True, highlight=False)
 
