@@ -1,13 +1,12 @@
 """The baseline: an extended Kalman filter on UWB ranges and planar odometry increments (filterpy)."""
 
 import numpy as np
-from pydantic import Field
-from scipy.stats import chi2
 
 from estimators.base import Report, Setup, Verdict
 from estimators.lidar.odometry import POSE, LidarOdometry
 from estimators.messages import Measurement, RangeFrame
-from estimators.models.range import horizontal_range, reduce_height
+from estimators.models.range import horizontal_range
+from estimators.range_gate import RangeGate
 
 
 class Ekf(LidarOdometry):
@@ -20,31 +19,17 @@ class Ekf(LidarOdometry):
     are tested against finite differences.
     """
 
-    class Config(LidarOdometry.Config):
+    class Config(RangeGate.Config, LidarOdometry.Config):
         """Settings of `ekf`."""
 
-        range_sigma: float = Field(0.10, gt=0, le=10, description="standard deviation of a range [m]")
-        range_gate: float = Field(
-            0.997, gt=0.5, lt=1, description="share of good ranges that pass the NIS gate"
-        )
-        suspect_for: float = Field(
-            0.5,
-            ge=0,
-            le=60,
-            description="after a range that failed the gate, its anchor is not believed for so long [s]: "
-            "what blocks a range does not go away at once",
-        )
-
     def __init__(self, config: Config, setup: Setup) -> None:
+        self._gate = RangeGate(config, setup)
         super().__init__(config, setup)
-        self._range_sigma = config.range_sigma
-        self._range_gate = float(chi2.ppf(config.range_gate, 1))
-        self._suspect_ns = round(config.suspect_for * 1e9)
 
     def reset(self) -> None:
         """Stand at the start again and trust every anchor."""
         super().reset()
-        self._gated_ns: dict[int, int] = {}
+        self._gate.reset()
 
     def update(self, measurement: Measurement) -> Report:
         """Predict to the measurement's time and take it; only ranges and increments are used."""
@@ -59,31 +44,18 @@ class Ekf(LidarOdometry):
         count = len(frame.ranges)
         verdicts = [Verdict.ACCEPTED] * count
         residuals, nis = np.full(count, np.nan), np.full(count, np.nan)
-        lever_arm = self._setup.tag_in_body
-        for i in range(count):
-            anchor_id = int(frame.anchor_ids[i])
-            anchor = self._setup.anchors.get(anchor_id)
-            if anchor is None:
-                verdicts[i] = Verdict.UNKNOWN_ANCHOR
+        for i, item in enumerate(self._gate.horizontal(frame)):
+            if isinstance(item, Verdict):
+                verdicts[i] = item
                 continue
-            reduced = reduce_height(float(frame.ranges[i]), self._range_sigma, self._setup.height_to(anchor))
-            if reduced is None:
-                verdicts[i] = Verdict.IMPOSSIBLE
-                continue
-            measured, sigma = reduced
-            predicted, by_pose = horizontal_range(self._filter.x[POSE], anchor, lever_arm)
+            anchor, measured, sigma = item
+            predicted, by_pose = horizontal_range(self._filter.x[POSE], anchor, self._setup.tag_in_body)
             H = np.zeros((1, 9))
             H[0, POSE] = by_pose
             variance = float((H @ self._filter.P @ H.T).item()) + sigma**2
             residuals[i] = measured - predicted
             nis[i] = residuals[i] ** 2 / variance
-            if nis[i] > self._range_gate:
-                verdicts[i] = Verdict.GATED
-                self._gated_ns[anchor_id] = frame.stamp_ns
-                continue
-            gated_ns = self._gated_ns.get(anchor_id)
-            if gated_ns is not None and frame.stamp_ns - gated_ns < self._suspect_ns:
-                verdicts[i] = Verdict.SUSPECT
-                continue
-            self._correct(np.array([measured]), H, np.array([predicted]), np.array([[sigma**2]]))
+            verdicts[i] = self._gate.judge(int(frame.anchor_ids[i]), frame.stamp_ns, float(nis[i]))
+            if verdicts[i] is Verdict.ACCEPTED:
+                self._correct(np.array([measured]), H, np.array([predicted]), np.array([[sigma**2]]))
         return Report(tuple(verdicts), residuals, nis)

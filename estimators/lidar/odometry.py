@@ -7,19 +7,16 @@ increment exactly what it is, a measurement between two poses that are both unce
 
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
-from pydantic import BaseModel, ConfigDict, Field
-from scipy.stats import chi2
 
 from estimators.base import Report, Setup, Verdict
 from estimators.geometry import lift, wrap_angle
-from estimators.messages import FloatArray, Measurement, PoseEstimate, PoseIncrement, RangeFrame
+from estimators.lidar.keyframes import START_SPEED_SIGMA, KeyframeTracker
+from estimators.messages import FloatArray, PoseEstimate, PoseIncrement
 from estimators.models.motion import constant_velocity, increment
 
 POSE = slice(0, 3)
 MOVING = slice(0, 6)
 REFERENCE = slice(6, 9)
-START_SPEED_SIGMA = 0.3
-"""Standard deviation of each velocity when the robot sets off [m/s, rad/s]."""
 MAX_HEADING_SIGMA = 0.35
 """An odometry that begins anew with a heading less certain than this [rad] leaves the heading unknown.
 
@@ -28,69 +25,33 @@ such case while the matcher finds its old keyframe again: then the reference, an
 """
 
 
-class LidarOdometry:
+class LidarOdometry(KeyframeTracker):
     """Kalman filter (filterpy) on increments only; what drifts here is what UWB must hold.
 
     Source: huang2024 Table 4, row "LiDAR"; stochastic cloning: Roumeliotis and Burdick, ICRA 2002.
     """
 
-    class Config(BaseModel):
+    class Config(KeyframeTracker.Config):
         """Settings of `lidar_odometry`."""
 
-        model_config = ConfigDict(extra="forbid", frozen=True)
-
-        increment_gate: float = Field(
-            0.99999, gt=0.5, lt=1, description="share of good increments that pass the NIS gate"
-        )
-        accel_noise: float = Field(
-            0.5,
-            gt=0,
-            le=100,
-            description="density of white acceleration [m/s^2/sqrt(Hz)]: about the robot's acceleration "
-            "times the square root of how long it lasts",
-        )
-        yaw_accel_noise: float = Field(
-            1.5,
-            gt=0,
-            le=100,
-            description="density of white angular acceleration [rad/s^2/sqrt(Hz)], likewise",
-        )
-
     def __init__(self, config: Config, setup: Setup) -> None:
-        self._setup = setup
-        self._noise = (config.accel_noise, config.yaw_accel_noise)
-        self._increment_gate = float(chi2.ppf(config.increment_gate, 3))
+        super().__init__(config, setup)
         self.reset()
 
     def reset(self) -> None:
         """Stand at the start again; the first measurement sets the clock."""
+        super().reset()
         start = self._setup.start
         self._filter = ExtendedKalmanFilter(dim_x=9, dim_z=3)
         self._filter.x = np.concatenate([start.pose, np.zeros(3), start.pose])
         sigma = np.concatenate([start.sigma, np.zeros(3), start.sigma])
         self._filter.P = np.diag(sigma**2)
-        self._stands_until_ns: int | None = None
-        self._stands = True
-        self._stamp_ns: int | None = None
-        self._reference_stamp_ns: int | None = None
         self._heading_known = True
 
     @property
     def state(self) -> tuple[FloatArray, FloatArray]:
         """State (9,) and covariance (9, 9) at the newest measurement, for tests."""
         return self._filter.x.copy(), self._filter.P.copy()
-
-    def update(self, measurement: Measurement) -> Report:
-        """Predict to an increment's time and take it; other measurements are not used."""
-        if isinstance(measurement, PoseIncrement):
-            if self._is_late(measurement.stamp_ns):
-                return Report((Verdict.LATE,))
-            report = self._update_increment(measurement)
-            if measurement.is_keyframe:
-                self._clone_reference(measurement.stamp_ns)
-            return report
-        count = len(measurement.ranges) if isinstance(measurement, RangeFrame) else 1
-        return Report((Verdict.NOT_USED,) * count)
 
     def pose_at(self, stamp_ns: int) -> PoseEstimate | None:
         """Pose predicted with constant velocity; None before the first measurement.
@@ -109,42 +70,21 @@ class LidarOdometry:
         return PoseEstimate(stamp_ns, T_map_body, self._setup.lift_covariance(cov), 0)
 
     def _motion(self, dt: float) -> tuple[FloatArray, FloatArray]:
-        return constant_velocity(dt, *self._noise)
+        return constant_velocity(dt, *self._accel_noise)
 
-    def _set_off(self) -> None:
-        """From here on the robot may move: a start heading that is held until now must not fade before."""
-        if self._stands:
-            self._stands = False
-            self._filter.P[3:6, 3:6] = np.eye(3) * START_SPEED_SIGMA**2
+    def _set_speed_free(self) -> None:
+        self._filter.P[3:6, 3:6] = np.eye(3) * START_SPEED_SIGMA**2
 
-    def _is_late(self, stamp_ns: int) -> bool:
-        return self._stamp_ns is not None and stamp_ns < self._stamp_ns
+    def _move(self, dt: float) -> None:
+        F, Q = np.eye(9), np.zeros((9, 9))
+        F[MOVING, MOVING], Q[MOVING, MOVING] = self._motion(dt)
+        self._filter.F, self._filter.Q = F, Q
+        self._filter.predict()
 
-    def _predict_to(self, stamp_ns: int) -> None:
-        if self._stamp_ns is None or self._stands_until_ns is None:
-            self._stamp_ns = stamp_ns
-            self._stands_until_ns = stamp_ns + round(self._setup.start.still_for * 1e9)
-        if stamp_ns > self._stands_until_ns:
-            self._set_off()
-        if not self._stands:
-            F, Q = np.eye(9), np.zeros((9, 9))
-            F[MOVING, MOVING], Q[MOVING, MOVING] = self._motion((stamp_ns - self._stamp_ns) * 1e-9)
-            self._filter.F, self._filter.Q = F, Q
-            self._filter.predict()
-        self._stamp_ns = stamp_ns
+    def _begin_anew(self) -> None:
+        self._heading_known &= bool(self._filter.P[2, 2] < MAX_HEADING_SIGMA**2)
 
-    def _update_increment(self, measured: PoseIncrement) -> Report:
-        founds = measured.from_stamp_ns == measured.stamp_ns
-        has_reference = measured.from_stamp_ns == self._reference_stamp_ns
-        is_possible = bool(np.isfinite(measured.increment).all()) and _is_covariance(measured.cov)
-        if has_reference and is_possible and not founds:
-            self._set_off()
-        self._predict_to(measured.stamp_ns)
-        if founds:
-            self._heading_known &= bool(self._filter.P[2, 2] < MAX_HEADING_SIGMA**2)
-            return Report((Verdict.ACCEPTED,))
-        if not (has_reference and is_possible):
-            return Report((Verdict.NO_REFERENCE if is_possible else Verdict.IMPOSSIBLE,))
+    def _follow(self, measured: PoseIncrement) -> Report:
         predicted, by_reference, by_pose = increment(self._filter.x[REFERENCE], self._filter.x[POSE])
         H = np.zeros((3, 9))
         H[:, POSE], H[:, REFERENCE] = by_pose, by_reference
@@ -164,18 +104,12 @@ class LidarOdometry:
             self._filter.x[i] = wrap_angle(self._filter.x[i])
         self._filter.P = 0.5 * (self._filter.P + self._filter.P.T)
 
-    def _clone_reference(self, stamp_ns: int) -> None:
+    def _take_reference(self) -> None:
         copy = np.eye(9)
         copy[REFERENCE, REFERENCE] = 0.0
         copy[REFERENCE, POSE] = np.eye(3)
         self._filter.x = copy @ self._filter.x
         self._filter.P = copy @ self._filter.P @ copy.T
-        self._reference_stamp_ns = stamp_ns
-
-
-def _is_covariance(cov: FloatArray) -> bool:
-    """Whether a matrix is finite and positive definite."""
-    return bool(np.isfinite(cov).all() and np.linalg.eigvalsh(cov)[0] > 0.0)
 
 
 def _increment_residual(measured: FloatArray, predicted: FloatArray) -> FloatArray:

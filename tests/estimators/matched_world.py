@@ -7,7 +7,7 @@ import numpy as np
 
 from estimators.base import Report, Setup, Start
 from estimators.ekf import Ekf
-from estimators.lidar.odometry import START_SPEED_SIGMA
+from estimators.lidar.keyframes import START_SPEED_SIGMA
 from estimators.messages import FloatArray, PoseIncrement, RangeFrame
 from tests.strategies import range_frame
 

@@ -1,0 +1,176 @@
+"""Measurements held against particles: residuals, gate and weights."""
+
+from math import atan2, cos, exp, sin, sqrt
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimators.kernels.algebra import wrapped
+from estimators.kernels.compilation import MATRIX, VECTOR, compiled, inlined
+from estimators.messages import FloatArray
+
+BoolArray: TypeAlias = NDArray[np.bool_]
+
+
+@inlined
+def range_residual(x: float, y: float, c: float, s: float, arm: FloatArray, row: FloatArray) -> float:
+    """Measured minus predicted range [m] of a body at (x, y) whose yaw has cosine c and sine s."""
+    dx = x + c * arm[0] - s * arm[1] - row[0]
+    dy = y + s * arm[0] + c * arm[1] - row[1]
+    return float(row[2] - sqrt(dx * dx + dy * dy))
+
+
+@inlined
+def landmark_residuals(x: float, y: float, yaw: float, row: FloatArray) -> tuple[float, float]:
+    """Measured minus predicted range [m] and bearing [rad] of a landmark, for a body at (x, y, yaw)."""
+    dx, dy = row[0] - x, row[1] - y
+    return row[2] - sqrt(dx * dx + dy * dy), wrapped(row[3] + yaw - atan2(dy, dx))
+
+
+@compiled(f"{MATRIX}({MATRIX}, {VECTOR}, {MATRIX}, {MATRIX})")
+def residuals(poses: FloatArray, arm: FloatArray, ranges: FloatArray, landmarks: FloatArray) -> FloatArray:
+    """Measured minus predicted.
+
+    Args:
+        poses: (N, 3 or more) x [m], y [m], yaw [rad] in the first columns, map frame.
+        arm: (3,) tag antenna in the body frame [m].
+        ranges: (M, 4).
+        landmarks: (L, 6).
+
+    Returns:
+        (N, M + 2 L): of the ranges, then range and bearing of each landmark.
+
+    Source: huang2024 Eq. (26), exponent; models as in `estimators.models`.
+    """
+    out = np.empty((len(poses), len(ranges) + 2 * len(landmarks)))
+    for i in range(len(poses)):
+        x, y, yaw = poses[i, 0], poses[i, 1], poses[i, 2]
+        c, s = cos(yaw), sin(yaw)
+        k = 0
+        for j in range(len(ranges)):
+            out[i, k] = range_residual(x, y, c, s, arm, ranges[j])
+            k += 1
+        for j in range(len(landmarks)):
+            out[i, k], out[i, k + 1] = landmark_residuals(x, y, yaw, landmarks[j])
+            k += 2
+    return out
+
+
+@compiled(f"Tuple(({VECTOR}, {VECTOR}))({MATRIX}, {VECTOR}, {VECTOR}, float64, boolean[::1])")
+def innovations(
+    residuals: FloatArray, weights: FloatArray, sigmas: FloatArray, gate: float, doubted: BoolArray
+) -> tuple[FloatArray, FloatArray]:
+    """Innovation and NIS of measurements, each after those before it that pass the gate.
+
+    The cloud's residuals are taken for Gaussian: an accepted one corrects the expectation of the others by
+    their covariance, as a Kalman filter's sequential update would.
+
+    Args:
+        residuals: (N, K) measured minus predicted.
+        weights: (N,) that sum to one.
+        sigmas: (K,) standard deviations of the measurements.
+        gate: greatest NIS that passes.
+        doubted: (K,) True where a measurement does not count whatever its NIS.
+
+    Returns:
+        Innovations (K,) and NIS (K,).
+    """
+    count = residuals.shape[1]
+    mean, cov = np.zeros(count), np.zeros((count, count))
+    for i in range(len(residuals)):
+        for j in range(count):
+            mean[j] += weights[i] * residuals[i, j]
+    for i in range(len(residuals)):
+        for j in range(count):
+            deviation = weights[i] * (residuals[i, j] - mean[j])
+            for k in range(count):
+                cov[j, k] += deviation * (residuals[i, k] - mean[k])
+    nis = np.empty(count)
+    for j in range(count):
+        cov[j, j] += sigmas[j] * sigmas[j]
+        nis[j] = mean[j] * mean[j] / cov[j, j]
+        if nis[j] <= gate and not doubted[j]:
+            for k in range(j + 1, count):
+                gain = cov[k, j] / cov[j, j]
+                mean[k] -= gain * mean[j]
+                for m in range(j + 1, count):
+                    cov[k, m] -= gain * cov[j, m]
+    return mean, nis
+
+
+@inlined
+def misfits(residuals: FloatArray, sigmas: FloatArray) -> FloatArray:
+    """Half the sum of squares (N,) of residuals (N, K) in units of their sigmas (K,)."""
+    out = np.empty(len(residuals))
+    for i in range(len(residuals)):
+        square = 0.0
+        for j in range(len(sigmas)):
+            scaled = residuals[i, j] / sigmas[j]
+            square += scaled * scaled
+        out[i] = 0.5 * square
+    return out
+
+
+@inlined
+def normalised(logarithms: FloatArray, weights: FloatArray) -> float:
+    """Fill in weights (N,) that sum to one from logarithms (N,); returns the effective sample size."""
+    greatest = logarithms.max()
+    total = 0.0
+    total_square = 0.0
+    for i in range(len(weights)):
+        weights[i] = exp(logarithms[i] - greatest)
+        total += weights[i]
+        total_square += weights[i] * weights[i]
+    weights /= total
+    return total * total / total_square
+
+
+@compiled(f"float64({VECTOR}, {MATRIX}, {VECTOR})")
+def reweigh(weights: FloatArray, residuals: FloatArray, sigmas: FloatArray) -> float:
+    """Multiply weights by the likelihood of independent Gaussian errors and normalise them, in place.
+
+    Args:
+        weights: (N,).
+        residuals: (N, K) measured minus predicted.
+        sigmas: (K,) standard deviations of the measurements; an infinite one does not count.
+
+    Returns:
+        Effective sample size.
+
+    Source: huang2024 Eq. (26) and (28).
+    """
+    return normalised(np.log(weights) - misfits(residuals, sigmas), weights)
+
+
+@compiled(f"float64({VECTOR}, {MATRIX}, {VECTOR}, float64, float64)")
+def reweigh_partly(
+    weights: FloatArray, residuals: FloatArray, sigmas: FloatArray, most: float, effective: float
+) -> float:
+    """As `reweigh`, with the likelihood raised to the greatest power that leaves enough effective particles.
+
+    Args:
+        weights: (N,).
+        residuals: (N, K) measured minus predicted.
+        sigmas: (K,) standard deviations of the measurements; an infinite one does not count.
+        most: greatest power that is asked for.
+        effective: sample size that shall be left.
+
+    Returns:
+        The power: `most`, or less, though never less than 0.005.
+
+    Source: Musso, Oudjane and Le Gland, in Sequential Monte Carlo Methods in Practice, 2001, 12.4.
+    """
+    logarithms, misfit = np.log(weights), misfits(residuals, sigmas)
+    if normalised(logarithms - most * misfit, weights) >= effective:
+        return most
+    low, high = 0.0, most
+    for _ in range(10):
+        power = 0.5 * (low + high)
+        if normalised(logarithms - power * misfit, weights) >= effective:
+            low = power
+        else:
+            high = power
+    power = min(most, max(low, 0.005))
+    normalised(logarithms - power * misfit, weights)
+    return power

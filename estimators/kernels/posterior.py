@@ -1,0 +1,189 @@
+"""The posterior of a pose: beetles that climb it, its mode, and particles around the mode.
+
+It is that of a Gaussian cloud and new measurements. Its arrays go together as a tuple: mean (3,) and lower
+Cholesky factor (3, 3) of the cloud; tag antenna (3,) in the body frame, ranges (M, 4), landmarks (L, 6).
+Poses are sought in the cloud's own coordinates u, ``pose = mean + factor u``: there it is a unit Gaussian.
+"""
+
+from math import cos, log, pi, sin, tan
+from typing import TypeAlias
+
+import numpy as np
+
+from estimators.kernels.algebra import cholesky, solve_lower, solve_upper, wrapped
+from estimators.kernels.compilation import MATRIX, VECTOR, compiled, inlined
+from estimators.kernels.likelihood import landmark_residuals, normalised, range_residual, residuals
+from estimators.messages import FloatArray
+
+Posterior: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]
+
+_POSTERIOR = f"Tuple(({VECTOR}, {MATRIX}, {VECTOR}, {MATRIX}, {MATRIX}))"
+_PULL = 2.0
+"""c1 and c2 of Eq. (21), as in `estimators.beetle_antennae`, like the three below."""
+_FIRST_INERTIA, _LAST_INERTIA = 1.0, 0.3
+_DISTURBANCE = 0.03
+_NUDGE = 1e-3
+"""Step of the numerical derivative, in units of u."""
+
+
+@inlined
+def _pose(u: FloatArray, mean: FloatArray, factor: FloatArray) -> tuple[float, float, float]:
+    return (
+        mean[0] + factor[0, 0] * u[0],
+        mean[1] + factor[1, 0] * u[0] + factor[1, 1] * u[1],
+        mean[2] + factor[2, 0] * u[0] + factor[2, 1] * u[1] + factor[2, 2] * u[2],
+    )
+
+
+@compiled(f"float64({VECTOR}, {_POSTERIOR})")
+def cost(u: FloatArray, posterior: Posterior) -> float:
+    """Negative logarithm of the posterior at u (3,), but for a constant.
+
+    Source: huang2024 Eq. (26), its logarithm, with the cloud's density.
+    """
+    mean, factor, arm, ranges, landmarks = posterior
+    x, y, yaw = _pose(u, mean, factor)
+    c, s = cos(yaw), sin(yaw)
+    square = u[0] * u[0] + u[1] * u[1] + u[2] * u[2]
+    for j in range(len(ranges)):
+        square += (range_residual(x, y, c, s, arm, ranges[j]) / ranges[j, 3]) ** 2
+    for j in range(len(landmarks)):
+        by_range, by_bearing = landmark_residuals(x, y, yaw, landmarks[j])
+        square += (by_range / landmarks[j, 4]) ** 2 + (by_bearing / landmarks[j, 5]) ** 2
+    return float(0.5 * square)
+
+
+@compiled(f"{VECTOR}({MATRIX}, {MATRIX}, {_POSTERIOR})")
+def search(particles: FloatArray, uniform: FloatArray, posterior: Posterior) -> FloatArray:
+    """Best place that a swarm of beetles finds.
+
+    This is `beetle_antennae.ImprovedBeetleAntennaeSearch`, place for place, in three dimensions.
+
+    Args:
+        particles: (N, 12) where the beetles start.
+        uniform: (K, 6 N + 3) random numbers of [0, 1), as the search would draw them in K iterations.
+        posterior: to be climbed.
+
+    Returns:
+        (3,) u of least cost.
+
+    Source: huang2024 Eq. (15)-(25), corrected.
+    """
+    mean, factor = posterior[:2]
+    count = len(particles)
+    starts, costs = np.empty((count, 3)), np.empty(count)
+    for i in range(count):
+        deviation = particles[i, :3] - mean
+        deviation[2] = wrapped(deviation[2])
+        starts[i] = solve_lower(factor, deviation)
+        costs[i] = cost(starts[i], posterior)
+    half = (count + 1) // 2
+    pull = log(half + 0.5) - np.log(np.arange(1, half + 1))
+    pull /= pull.sum()
+    beetles, own = starts.copy(), starts.copy()
+    velocity = np.zeros_like(starts)
+    right, left = np.empty(3), np.empty(3)
+    for k in range(len(uniform)):
+        inertia = _FIRST_INERTIA - (_FIRST_INERTIA - _LAST_INERTIA) * k / len(uniform)  # (18)
+        centre = np.zeros(3)
+        order = np.argsort(costs)
+        for i in range(half):
+            for j in range(3):
+                centre[j] += pull[i] * own[order[i], j]
+        for i in range(count):
+            for j in range(3):
+                place = beetles[i, j]
+                velocity[i, j] = (  # (21)
+                    inertia * velocity[i, j]
+                    + _PULL * uniform[k, 3 * i + j] * (own[i, j] - place)
+                    + _PULL * uniform[k, 3 * (count + i) + j] * (centre[j] - place)
+                )
+                right[j] = place + 1.5 * velocity[i, j]  # (22)
+                left[j] = place + 0.5 * velocity[i, j]  # (23)
+            right_cost, left_cost = cost(right, posterior), cost(left, posterior)
+            moved = right if right_cost < left_cost else left  # (24)
+            for j in range(3):
+                velocity[i, j] = moved[j] - beetles[i, j]
+                beetles[i, j] = moved[j]
+            if min(right_cost, left_cost) < costs[i]:
+                costs[i] = min(right_cost, left_cost)
+                own[i] = moved
+        best = costs.argmin()
+        for j in range(3):  # (25)
+            spread = np.abs(beetles[:, j] - beetles[:, j].mean()).mean()
+            right[j] = own[best, j] + _DISTURBANCE * spread * tan(pi * (uniform[k, 6 * count + j] - 0.5))
+        disturbed_cost = cost(right, posterior)
+        if disturbed_cost < costs[best]:
+            costs[best] = disturbed_cost
+            own[best] = right
+    found: FloatArray = own[costs.argmin()].copy()
+    return found
+
+
+@compiled(f"Tuple(({VECTOR}, {MATRIX}))({VECTOR}, {_POSTERIOR})")
+def gauss_newton(u: FloatArray, posterior: Posterior) -> tuple[FloatArray, FloatArray]:
+    """One step from u (3,) towards the mode, not taken if it leads upwards.
+
+    Returns:
+        u (3,) after the step; lower Cholesky factor (3, 3) of the posterior's information matrix at u.
+    """
+    mean, factor, arm, ranges, landmarks = posterior
+    poses = np.empty((7, 3))
+    for k in range(7):
+        point = u.copy()
+        if k > 0:
+            point[(k - 1) // 2] += _NUDGE if k % 2 else -_NUDGE
+        poses[k] = _pose(point, mean, factor)
+    nudged = residuals(poses, arm, ranges, landmarks)
+    information, downhill = np.eye(3), -u
+    for j in range(nudged.shape[1]):
+        sigma = (
+            ranges[j, 3] if j < len(ranges) else landmarks[(j - len(ranges)) // 2, 4 + (j - len(ranges)) % 2]
+        )
+        row = np.empty(3)
+        for a in range(3):
+            row[a] = wrapped(nudged[2 * a + 2, j] - nudged[2 * a + 1, j]) / (2.0 * _NUDGE * sigma)
+        for a in range(3):
+            downhill[a] += row[a] * nudged[0, j] / sigma
+            for b in range(3):
+                information[a, b] += row[a] * row[b]
+    root = cholesky(information)
+    stepped = u + solve_upper(root, solve_lower(root, downhill))
+    return (stepped if cost(stepped, posterior) < cost(u, posterior) else u), root
+
+
+@compiled(
+    f"Tuple(({MATRIX}, {VECTOR}, float64))({VECTOR}, {MATRIX}, {MATRIX}, {VECTOR}, float64, {_POSTERIOR})"
+)
+def draw(
+    mode: FloatArray,
+    root: FloatArray,
+    normal: FloatArray,
+    stretch: FloatArray,
+    freedom: float,
+    posterior: Posterior,
+) -> tuple[FloatArray, FloatArray, float]:
+    """Particles of a multivariate t distribution around the mode, weighted to be samples of the posterior.
+
+    Args:
+        mode: (3,) u.
+        root: (3, 3) lower Cholesky factor of the information matrix there.
+        normal: (N, 3) standard normal numbers.
+        stretch: (N,) roots of `freedom` over chi-square numbers of that many degrees of freedom.
+        freedom: degrees of freedom of the distribution.
+        posterior: the target.
+
+    Returns:
+        Poses (N, 3), map frame; weights (N,) that sum to one; effective sample size.
+    """
+    mean, factor = posterior[:2]
+    poses, logarithms = np.empty((len(normal), 3)), np.empty(len(normal))
+    for i in range(len(normal)):
+        offset = normal[i] * stretch[i]
+        u = mode + solve_upper(root, offset)
+        square = offset[0] ** 2 + offset[1] ** 2 + offset[2] ** 2
+        logarithms[i] = 0.5 * (freedom + 3.0) * log(1.0 + square / freedom) - cost(u, posterior)
+        poses[i] = _pose(u, mean, factor)
+    weights = np.empty(len(normal))
+    effective = normalised(logarithms, weights)
+    return poses, weights, effective

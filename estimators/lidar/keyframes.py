@@ -1,0 +1,124 @@
+"""Odometry increments from a known start, in stamp order: what every estimator on them does alike."""
+
+from abc import ABC, abstractmethod
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+from scipy.stats import chi2
+
+from estimators.base import Report, Setup, Verdict
+from estimators.messages import FloatArray, Measurement, PoseIncrement, RangeFrame
+
+START_SPEED_SIGMA = 0.3
+"""Standard deviation of each velocity when the robot sets off [m/s, rad/s]."""
+
+
+class KeyframeTracker(ABC):
+    """Follows increments that start at keyframes; the robot may stand still at first.
+
+    What is held of the pose, and how it is moved and corrected, is the subclass's.
+    """
+
+    class Config(BaseModel):
+        """Settings of every estimator on increments."""
+
+        model_config = ConfigDict(extra="forbid", frozen=True)
+
+        increment_gate: float = Field(
+            0.99999, gt=0.5, lt=1, description="share of good increments that pass the NIS gate"
+        )
+        accel_noise: float = Field(
+            0.5,
+            gt=0,
+            le=100,
+            description="density of white acceleration [m/s^2/sqrt(Hz)]: about the robot's acceleration "
+            "times the square root of how long it lasts",
+        )
+        yaw_accel_noise: float = Field(
+            1.5,
+            gt=0,
+            le=100,
+            description="density of white angular acceleration [rad/s^2/sqrt(Hz)], likewise",
+        )
+
+    def __init__(self, config: Config, setup: Setup) -> None:
+        self._setup = setup
+        self._accel_noise = (config.accel_noise, config.yaw_accel_noise)
+        self._increment_gate = float(chi2.ppf(config.increment_gate, 3))
+
+    def reset(self) -> None:
+        """Stand at the start again; the first measurement sets the clock."""
+        self._stands_until_ns: int | None = None
+        self._stands = True
+        self._stamp_ns: int | None = None
+        self._reference_stamp_ns: int | None = None
+
+    def update(self, measurement: Measurement) -> Report:
+        """Predict to an increment's time and take it; other measurements are not used."""
+        if isinstance(measurement, PoseIncrement):
+            if self._is_late(measurement.stamp_ns):
+                return Report((Verdict.LATE,))
+            report = self._update_increment(measurement)
+            if measurement.is_keyframe:
+                self._take_reference()
+                self._reference_stamp_ns = measurement.stamp_ns
+            return report
+        count = len(measurement.ranges) if isinstance(measurement, RangeFrame) else 1
+        return Report((Verdict.NOT_USED,) * count)
+
+    @abstractmethod
+    def _set_speed_free(self) -> None:
+        """The robot, which stood, may have any speed from here on."""
+
+    @abstractmethod
+    def _move(self, dt: float) -> None:
+        """Predict by a time step [s] that is not negative."""
+
+    @abstractmethod
+    def _follow(self, measured: PoseIncrement) -> Report:
+        """Gate an increment from the held reference and take it."""
+
+    @abstractmethod
+    def _take_reference(self) -> None:
+        """The pose of now is where later increments start."""
+
+    def _begin_anew(self) -> None:  # noqa: B027
+        """An odometry without an earlier reference begins now."""
+
+    def _set_off(self) -> None:
+        """From here on the robot may move: a start heading that is held until now must not fade before."""
+        if self._stands:
+            self._stands = False
+            self._set_speed_free()
+
+    def _is_late(self, stamp_ns: int) -> bool:
+        return self._stamp_ns is not None and stamp_ns < self._stamp_ns
+
+    def _predict_to(self, stamp_ns: int) -> None:
+        if self._stamp_ns is None or self._stands_until_ns is None:
+            self._stamp_ns = stamp_ns
+            self._stands_until_ns = stamp_ns + round(self._setup.start.still_for * 1e9)
+        if stamp_ns > self._stands_until_ns:
+            self._set_off()
+        if not self._stands:
+            self._move((stamp_ns - self._stamp_ns) * 1e-9)
+        self._stamp_ns = stamp_ns
+
+    def _update_increment(self, measured: PoseIncrement) -> Report:
+        founds = measured.from_stamp_ns == measured.stamp_ns
+        has_reference = measured.from_stamp_ns == self._reference_stamp_ns
+        is_possible = bool(np.isfinite(measured.increment).all()) and _is_covariance(measured.cov)
+        if has_reference and is_possible and not founds:
+            self._set_off()
+        self._predict_to(measured.stamp_ns)
+        if founds:
+            self._begin_anew()
+            return Report((Verdict.ACCEPTED,))
+        if not (has_reference and is_possible):
+            return Report((Verdict.NO_REFERENCE if is_possible else Verdict.IMPOSSIBLE,))
+        return self._follow(measured)
+
+
+def _is_covariance(cov: FloatArray) -> bool:
+    """Whether a matrix is finite and positive definite."""
+    return bool(np.isfinite(cov).all() and np.linalg.eigvalsh(cov)[0] > 0.0)
