@@ -56,7 +56,7 @@ class ParticleCloud(KeyframeTracker):
 
         super().__init__(config, setup)
         self._cloud, self._likelihood = cloud, likelihood
-        self._count = config.particles
+        self._usual_count = config.particles
         self._seed = config.seed
         self._gate = RangeGate(config, setup)
         self._landmark_gate = float(chi2.ppf(config.landmark_gate, 1))
@@ -69,6 +69,7 @@ class ParticleCloud(KeyframeTracker):
         super().reset()
         self._gate.reset()
         self._rng = np.random.default_rng(self._seed)
+        self._count = self._usual_count
         self._particles = np.zeros((self._count, 12))
         self._weights = np.full(self._count, 1.0 / self._count)
         start = self._setup.start

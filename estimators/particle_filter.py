@@ -12,6 +12,9 @@ from estimators.messages import FloatArray
 from estimators.particle_cloud import POSE, ParticleCloud, sigmas_of
 from estimators.resampling import RESAMPLING
 
+MAX_HEADING_SIGMA = 0.35
+"""With a less certain heading [rad] a cloud is a ring, not a Gaussian, and needs more particles."""
+_LEAST_OF_A_RING = 500
 _SHARES_BELOW = 0.25
 """Measurements that would leave a smaller share of effective particles are not taken at once."""
 _SHARE_LEAVES = 0.5
@@ -46,18 +49,27 @@ class ParticleFilter(ParticleCloud):
 
     def __init__(self, config: Config, setup: Setup) -> None:
         self._indices = RESAMPLING[config.resampling]
-        self._least_effective = config.resample_below * config.particles
-        self._kernel_width = config.bandwidth * _best_width(config.particles)
+        self._resample_below = config.resample_below
+        self._bandwidth = config.bandwidth
         super().__init__(config, setup)
 
     def _settle(
         self, before: FloatArray, effective: float, ranges: FloatArray, landmarks: FloatArray
     ) -> None:
-        if effective < _SHARES_BELOW * self._count:
+        count = max(self._usual_count, _LEAST_OF_A_RING) if self._is_ring(before) else self._usual_count
+        if count != self._count:
+            self._weights = before
+            self._resample(count)
+            self._weigh_in_shares(ranges, landmarks)
+        elif effective < _SHARES_BELOW * count:
             self._weights = before
             self._weigh_in_shares(ranges, landmarks)
-        elif effective < self._least_effective:
-            self._resample()
+        elif effective < self._resample_below * count:
+            self._resample(count)
+
+    def _is_ring(self, weights: FloatArray) -> bool:
+        _, cov = self._cloud.moments(self._particles, weights, 3)
+        return bool(cov[2, 2] > MAX_HEADING_SIGMA**2)
 
     def _weigh_in_shares(self, ranges: FloatArray, landmarks: FloatArray) -> None:
         """Take measurements a share at a time, resampling in between."""
@@ -69,18 +81,20 @@ class ParticleFilter(ParticleCloud):
             )
             if left <= 0.0:
                 return
-            self._resample()
+            self._resample(self._count)
 
-    def _resample(self) -> None:
+    def _resample(self, count: int) -> None:
+        """Go on with so many particles of equal weight."""
         mean, factor, gain = self._cloud.pose_law(self._particles, self._weights)
-        self._particles = self._particles[self._indices(self._weights, self._rng)]
-        self._weights = np.full(self._count, 1.0 / self._count)
-        if self._kernel_width > 0.0:
+        self._particles = self._particles[self._indices(self._weights, count, self._rng)]
+        self._count = count
+        self._weights = np.full(count, 1.0 / count)
+        if self._bandwidth > 0.0:
             deviations = self._particles[:, POSE] - mean
             deviations[:, 2] = wrap_angles(deviations[:, 2])
-            shrinkage = sqrt(1.0 - self._kernel_width**2)
-            shift = self._kernel_width * self._noise_beside(POSE) @ factor.T
-            self._cloud.put(self._particles, mean + shrinkage * deviations + shift, gain)
+            width = self._bandwidth * _best_width(count)
+            shift = width * self._noise_beside(POSE) @ factor.T
+            self._cloud.put(self._particles, mean + sqrt(1.0 - width**2) * deviations + shift, gain)
 
 
 def _best_width(count: int) -> float:

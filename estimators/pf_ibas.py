@@ -31,8 +31,6 @@ from estimators.particle_cloud import POSE, ParticleCloud, sigmas_of
 from estimators.particle_filter import ParticleFilter
 from estimators.resampling import systematic
 
-MAX_HEADING_SIGMA = 0.35
-"""A cloud with a less certain heading [rad] is no Gaussian in the plane: a ring, rather."""
 _SEARCH_BELOW = 0.5
 """Share of effective particles above which the best of them is near enough to the mode without a search."""
 _PRINTED_SEARCH = PrintedImprovedBeetleAntennaeSearch(step=0.15)
@@ -76,7 +74,9 @@ class PfIbas(ParticleFilter):
     def _settle(
         self, before: FloatArray, effective: float, ranges: FloatArray, landmarks: FloatArray
     ) -> None:
-        if effective < self._least_effective:
+        if self._count != self._usual_count or self._is_ring(before):
+            super()._settle(before, effective, ranges, landmarks)
+        elif effective < self._resample_below * self._count:
             sampled = self._sample_posterior(before, effective, ranges, landmarks)
             if not sampled:
                 super()._settle(before, effective, ranges, landmarks)
@@ -93,15 +93,13 @@ class PfIbas(ParticleFilter):
             landmarks: (L, 6).
         """
         mean, factor, gain = self._cloud.pose_law(self._particles, before)
-        if factor[2] @ factor[2] > MAX_HEADING_SIGMA**2:
-            return False
         posterior = mean, factor, self._arm, ranges, landmarks
         iterations = self._iterations if effective < _SEARCH_BELOW * self._count else 0
         uniform = self._rng.random((iterations, 6 * self._count + 3))
         best = self._posterior.search(self._particles, uniform, posterior)
         mode, root = self._posterior.gauss_newton(best, posterior)
         stretch = np.sqrt(self._freedom / self._rng.chisquare(self._freedom, self._count))
-        particles = self._particles[self._rng.permutation(self._indices(before, self._rng))]
+        particles = self._particles[self._rng.permutation(self._indices(before, self._count, self._rng))]
         normal = self._rng.standard_normal((self._count, 3))
         self._cloud.match(normal, particles, np.full(self._count, 1.0 / self._count), _ALL.start, _ALL.stop)
         poses, weights, served = self._posterior.draw(mode, root, normal, stretch, self._freedom, posterior)
@@ -160,4 +158,6 @@ class PrintedPfIbas(ParticleCloud):
         self._cloud.put(self._particles, poses, gain)
         misfits = misfit(found.beetles)
         weights = np.exp(misfits.min() - misfits)
-        self._particles = self._particles[systematic(weights / weights.sum(), self._rng)]  # step 6, (28)
+        self._particles = self._particles[
+            systematic(weights / weights.sum(), self._count, self._rng)
+        ]  # step 6, (28)
