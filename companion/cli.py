@@ -20,6 +20,7 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 
 from companion import __version__
 from companion.config import default_toml, load_config, params_dir
+from companion.doctor import app as doctor
 from companion.errors import UserError
 
 if TYPE_CHECKING:
@@ -38,6 +39,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     add_completion=False,
 )
+app.add_typer(doctor, name="doctor")
 out = Console()
 err = Console(stderr=True, highlight=False)
 
@@ -184,9 +186,9 @@ def emulate(scenario: Scenario_, seed: Seed = None, sets: Sets = None) -> None:
 
     loaded = _load_scenario(scenario, seed, sets)
     emulator = Emulator(loaded)
-    for port in emulator.ports:
-        out.print(f"{port.name}  {port.path}", highlight=False)
-    options = " ".join(f"--set sensor.{port.name}.port={port.path}" for port in emulator.ports)
+    for name, port in emulator.ports.items():
+        out.print(f"{name}  {port.path}", highlight=False)
+    options = " ".join(f"--set sensor.{name}.port={port.path}" for name, port in emulator.ports.items())
     site = _scenario_path(scenario).parent / loaded.file.site
     err.print("In another terminal:")
     err.print(f"  companion run --site {site.resolve()} {options}", soft_wrap=True)

@@ -35,6 +35,8 @@ class Sensor(Protocol):
 
     MEASURES: ClassVar[frozenset[type]]
     """Types of the measurements it makes."""
+    BAUDS: ClassVar[tuple[int, ...]]
+    """Rates at which its devices speak, the most usual first; for those whose port is looked for."""
 
     stats: DecodeStats
 
