@@ -188,6 +188,7 @@ def emulate(scenario: Scenario_, seed: Seed = None, sets: Sets = None) -> None:
     emulator = Emulator(loaded)
     for name, port in emulator.ports.items():
         out.print(f"{name}  {port.path}", highlight=False)
+    out.file.flush()
     options = " ".join(f"--set sensor.{name}.port={port.path}" for name, port in emulator.ports.items())
     site = _scenario_path(scenario).parent / loaded.file.site
     err.print("In another terminal:")

@@ -32,6 +32,8 @@ def describe(wire: SerialWire, voice: Voice, seconds: float) -> str:
         voice: what was recognised there.
         seconds: how long a device that sends by itself is watched.
     """
+    if voice.fault:
+        return str(voice)
     try:
         wire.set_baud(voice.baud)  # forgets what has piled up
         match voice.speaker:
@@ -40,7 +42,7 @@ def describe(wire: SerialWire, voice: Voice, seconds: float) -> str:
             case "rplidar":
                 return f"{_rplidar(wire)}, at {voice.baud} baud"
     except OSError as error:
-        return f"{voice.speaker}, then lost: {error}"
+        return f"{voice}, then lost: {error}"
     if voice.speaker == MAVLINK and (beat := find_heartbeat(voice.data)):
         sender = "autopilot" if beat.component == AUTOPILOT_COMPONENT else f"component {beat.component}"
         return f"MAVLink {sender}, system {beat.system}, at {voice.baud} baud"
@@ -49,29 +51,25 @@ def describe(wire: SerialWire, voice: Voice, seconds: float) -> str:
             f"NMEA text at {voice.baud} baud ({sentence.decode()}): if this is a LinkTrack module, set its "
             "protocol to Node_Frame2"
         )
-    if voice.speaker is None and voice.data and not voice.fault:
+    if voice.speaker is None and voice.data:
         return (
             f"{len(voice.data)} bytes at {voice.baud} baud, none understood at any rate "
             "(another device, or an open RX line?)"
         )
-    if not voice.data and not voice.fault:
+    if voice.speaker is None:
         return "silent (is the device powered, do RX and TX go to its TX and RX?)"
     return str(voice)
 
 
 def _linktrack(wire: SerialWire, seconds: float) -> str:
     sensor = LinkTrack(LinkTrack.Config())
-    heard = [(time.monotonic(), frame) for data in _read(wire, seconds) for frame in sensor.frames(data)]
-    if not heard:
+    frames = [frame for data in _read(wire, seconds) for frame in sensor.frames(data)]
+    if not frames:
         return "LinkTrack module, then silent"
-    kinds = Counter(type(frame) for _, frame in heard)
-    kind = kinds.most_common(1)[0][0]
-    times = [at for at, frame in heard if type(frame) is kind]
+    kind, count = Counter(type(frame) for frame in frames).most_common(1)[0]
     name = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", kind.__name__)
-    said = [f"LinkTrack {_sender(heard[0][1])}".rstrip(), name]
-    if len(times) > 1:
-        said.append(f"{(len(times) - 1) / (times[-1] - times[0]):.0f} Hz")
-    if not any(isinstance(m, RangeFrame) for _, frame in heard for m in measurements(frame, 0)):
+    said = [f"LinkTrack {_sender(frames[0])}".rstrip(), name, f"{count / seconds:.0f} Hz"]
+    if not any(isinstance(m, RangeFrame) for frame in frames for m in measurements(frame, 0)):
         said.append("NO RANGES (is its output Node_Frame2, are anchors on?)")
     return ", ".join(said)
 

@@ -95,19 +95,19 @@ def _voices(
     seconds: float,
     say: Callable[[str], None],
 ) -> dict[str, Voice]:
-    """The best that was heard on each line, at the rates of all drivers, the most usual first."""
+    """Who speaks on each line, at the rates of all drivers, the most usual first."""
     rates = [new_sensor(driver).BAUDS for driver in SENSORS]
     columns = zip_longest(*rates, [TELEMETRY_BAUD])
-    waiting, best = dict(wires), dict[str, Voice]()
+    waiting, voices = dict(wires), dict[str, Voice]()
     for baud in dict.fromkeys(filter(None, chain.from_iterable(columns))):
         if waiting:
             say(f"listening at {baud} baud on {', '.join(waiting)}")
         for path, voice in listen(waiting, baud, ask, threading.Event(), seconds):
-            if path not in best or voice.speaker or len(voice.data) > len(best[path].data):
-                best[path] = voice
+            if path not in voices or voice.speaker or voice.fault:
+                voices[path] = voice
             if voice.is_final:
                 del waiting[path]
-    return best
+    return voices
 
 
 def _finding(path: str, ports: Sequence[ListPortInfo], text: str, voice: Voice) -> Finding:

@@ -70,7 +70,7 @@ def listen(
     """Listen to lines at once, then ask on those that are silent; gives each as soon as it is known.
 
     Args:
-        wires: lines by any name; each is left at the rate of its voice.
+        wires: lines by any name; each that speaks is left at the rate of its voice.
         baud: rate to listen at.
         ask: drivers whose dialogue may be tried, with the rates of their devices.
         closing: ends it early.
@@ -174,7 +174,7 @@ def _ask(wire: SerialWire, driver: str, bauds: Sequence[int], closing: threading
 class Finder:
     """Opens the line on which a sensor speaks, for a `Port`; its str() says where that was last.
 
-    The first port by name wins when there are several.
+    When the sensor speaks on several ports any of them is taken: such ports need their names.
 
     Args:
         address: which ports may be looked at.

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+import threading
 import tomllib
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -141,6 +142,17 @@ def test_a_rate_that_is_not_the_usual_one_is_found(plug: Plug) -> None:
     assert (found["tag"].baud, found["lidar"].baud) == (460_800, 1_000_000)
 
 
+def test_the_rate_of_a_tag_is_told_however_its_frames_are_bundled(plug: Plug) -> None:
+    device = plug("tty", silent)
+    line = SerialWire(PortAddress(device.path, 921_600))
+    writer = threading.Timer(0.1, lambda: os.write(device.master, tag()(b"") * 10))
+    writer.start()
+    text = describe(line, Voice("linktrack", 921_600), 1.0)
+    writer.join()
+    line.close()
+    assert text == "LinkTrack tag 3, Node_Frame2, 10 Hz, at 921600 baud"
+
+
 def test_a_tag_without_ranges_and_a_sick_lidar_say_so(plug: Plug) -> None:
     lonely = encode(NodeFrame3(id=5, role=2, local_time_ms=0, system_time_ms=0, voltage=5.0, nodes=()))
     found = check(plug("tag", sends(lonely)).link, plug("lidar", lidar(HealthStatus.ERROR)).link)
@@ -188,6 +200,27 @@ def test_a_device_that_vanishes_while_it_is_looked_at_is_said_to_be_lost(plug: P
     assert describe(line, Voice("linktrack", 921_600, b"x"), LISTEN).startswith("linktrack, then lost: ")
     device.plug()
     line.close()
+
+
+def test_a_device_that_vanishes_after_some_noise_is_said_to_be_lost(plug: Plug) -> None:
+    device = plug("tty", sends(GARBAGE))
+
+    def unplug(progress: str) -> None:
+        if "at 115200 baud" in progress:
+            device.unplug()
+
+    found = check_ports([device.path], LISTEN, unplug)
+    device.plug()
+    assert found[0].text.startswith("lost: ")
+
+
+def test_only_what_comes_now_is_reported(plug: Plug) -> None:
+    device = plug("tty", silent)
+    line = SerialWire(PortAddress(device.path, 921_600))
+    os.write(device.master, tag()(b"") * 10)
+    text = describe(line, Voice("linktrack", 921_600, b""), LISTEN)
+    line.close()
+    assert text == "LinkTrack module, then silent, at 921600 baud"
 
 
 def adapter(device: Device, serial_number: str | None, vid: int | None = 0x10C4) -> SysFS:

@@ -150,9 +150,9 @@ def test_a_given_rate_is_the_only_one(tmp_path: Path, plug: Plug) -> None:
     assert found(finder(tmp_path, "linktrack", 460_800)) == f"{tmp_path}/tty0 at 460800 baud"
 
 
-def test_a_scan_that_someone_left_running_is_ended_and_answered(tmp_path: Path, plug: Plug) -> None:
-    plug("tty0", lidar(running_scan=SCAN))
-    assert found(finder(tmp_path, "rplidar")) == f"{tmp_path}/tty0 at 115200 baud"
+def test_a_scan_that_someone_left_running_is_ended_at_its_rate(tmp_path: Path, plug: Plug) -> None:
+    plug("tty0", lidar(running_scan=SCAN), 460_800)
+    assert found(finder(tmp_path, "rplidar")) == f"{tmp_path}/tty0 at 460800 baud"
 
 
 def test_nothing_is_sent_to_who_speaks(tmp_path: Path, plug: Plug) -> None:

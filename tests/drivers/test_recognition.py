@@ -83,6 +83,11 @@ def test_a_good_frame_in_much_else_is_a_chance(chunk: int) -> None:
     assert speaker(FRAME + GARBAGE * 10, chunk) == (None, None)
 
 
+def test_good_frames_among_more_bad_ones_are_a_chance() -> None:
+    bad = b"\x55\x01" + bytes(126)
+    assert speaker(10 * (2 * bad + FRAME), 100) == (None, None)
+
+
 @pytest.mark.parametrize("stem", stems("linktrack_stream_*", "linktrack_sitl_stream"))
 def test_every_stream_of_linktrack_is_known(stem: str) -> None:
     assert speaker(stream(stem), 256)[0] == "linktrack"

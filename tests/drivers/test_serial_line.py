@@ -97,6 +97,25 @@ def test_who_uses_a_port_is_found_behind_links_and_its_far_side_does_not_count(p
         assert str(found[pty.path][0]).startswith("cat -c ")
 
 
+def test_a_port_that_is_given_twice_is_said_to_be(pty: Pty) -> None:
+    serve = "import os, sys; m, s = os.openpty(); print(os.ttyname(s), flush=True); sys.stdin.read()"
+    with subprocess.Popen(
+        [sys.executable, "-c", serve], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as far_side:
+        assert far_side.stdout is not None
+        path = far_side.stdout.readline().strip()
+        line = wire(path)
+        assert refusal(path).endswith(f"(pid {os.getpid()}), this one: is the port given twice?)")
+        line.close()
+        far_side.kill()
+
+
+def test_a_console_of_the_kernel_is_in_use(pty: Pty, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "active").write_text(f"tty0 {Path(pty.path).name}\n")
+    monkeypatch.setattr("drivers.port_advice._CONSOLES", tmp_path / "active")
+    assert list(map(str, holders([pty.path])[pty.path])) == ["the kernel, as its console"]
+
+
 def test_the_claim_of_another_program_counts_even_for_root(pty: Pty) -> None:
     fcntl.ioctl(pty.slave, termios.TIOCEXCL)
     assert "in use by another program" in refusal(pty.link)
