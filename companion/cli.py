@@ -352,8 +352,9 @@ def _status_line(status: "LiveStatus") -> str:
         f"sent {status.poses_sent}",
         f"autopilot {status.autopilot}" if status.autopilot is not None else "no autopilot heard",
     ]
-    if lost := status.dropped_chunks + status.stale_ticks:
-        parts.append(f"dropped {lost}")
+    parts += [f"{name} dropped {count}" for name, count in status.dropped.items() if count]
+    if status.stale_ticks:
+        parts.append(f"late {status.stale_ticks}")
     if health.reason:
         parts.append(health.reason)
     return "  ".join(parts)

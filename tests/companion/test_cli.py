@@ -84,7 +84,18 @@ def test_dump_config(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "command", [[], ["demo"], ["run"], ["simulate"], ["emulate"], ["replay"], ["dump-config"]]
+    "command",
+    [
+        [],
+        ["demo"],
+        ["run"],
+        ["simulate"],
+        ["emulate"],
+        ["replay"],
+        ["dump-config"],
+        ["doctor"],
+        ["doctor", "ports"],
+    ],
 )
 def test_help_teaches(tmp_path: Path, command: list[str]) -> None:
     done = companion(*command, "--help", cwd=tmp_path)
@@ -121,7 +132,7 @@ BAD_INPUT = {
     "link is a file": (["run", "--site", "demo_room", "--mavlink", "text.mcap"], "text.mcap is a file"),
     "unknown scenario": (
         ["emulate", "moon"],
-        "no file moon and none of that name in params/scenarios; there are: square_room",
+        "no file moon and none of that name in params/scenarios; there are: hostile_room, square_room",
     ),
     "unwritable log": (["simulate", "square_room", "--out", "text.mcap/log"], "cannot write the log"),
     "unwritable folder": (["demo", "--out", "text.mcap/demo"], "cannot write the log"),

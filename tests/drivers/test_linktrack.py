@@ -279,24 +279,28 @@ CONSOLE = encode(
 def test_only_ranges_of_the_set_tag_are_given_out(caplog: pytest.LogCaptureFixture) -> None:
     assert rows(new_sensor(tag_id=5).feed(CONSOLE, 0)) == [(5, [0], [6.0])]
     assert new_sensor(tag_id=7).feed(CONSOLE, 0) == []
+    assert new_sensor(tag_id=0).feed(CONSOLE, 0) == []
     assert [type(m) for m in new_sensor(tag_id=7).feed(NODE_FRAME2, 0)] == [ImuSample, Attitude]
     assert caplog.records == []
 
 
 def test_a_second_tag_is_warned_of_once_when_none_is_set(caplog: pytest.LogCaptureFixture) -> None:
     sensor = new_sensor()
-    assert [tag for tag, *_ in rows(sensor.feed(CONSOLE * 2, 0))] == [4, 5, 6] * 2
+    for _ in range(2):
+        assert [tag for tag, *_ in rows(sensor.feed(CONSOLE, 0))] == [4, 5, 6]
     (record,) = caplog.records
     assert record.levelno == logging.WARNING
-    assert "tag 4" in record.message
-    assert "tag 5" in record.message
+    assert "tags 4, 5, 6" in record.message
     assert "set tag_id" in record.message
 
 
-def test_one_tag_is_nothing_to_warn_of(caplog: pytest.LogCaptureFixture) -> None:
+def test_one_tag_is_nothing_to_warn_of_before_there_is_a_second(caplog: pytest.LogCaptureFixture) -> None:
     sensor = new_sensor()
     sensor.feed(NODE_FRAME2 + TAG_FRAME0 + NODE_FRAME3, 0)
+    sensor.feed(NODE_FRAME3, 0)
     assert caplog.records == []
+    sensor.feed(AOA_NODE_FRAME0, 0)
+    assert len(caplog.records) == 1
 
 
 # When

@@ -293,6 +293,18 @@ def test_a_descriptor_inside_a_good_capsule_is_data(
     assert len(nodes(events)) == 2 * PACKET_SAMPLES[scan_type]
 
 
+def test_at_the_place_of_a_packet_a_descriptor_wins_over_a_packet_that_begins_like_it() -> None:
+    body = bytearray(EXPRESS[2:] + bytes(77))  # begins at 0x0054 / 64 deg
+    for byte in bytes(body):
+        body[-1] ^= byte
+    body[-1] ^= 0xA5
+    alike = framed(bytes(body))
+    assert alike.startswith(EXPRESS)
+    data = EXPRESS + capsule(350, True) + alike + capsule(10) + capsule(20)
+    for chunks in ([data], single_bytes(data)):
+        assert [type(event) for event in feed(chunks)].count(ScanStarted) == 2
+
+
 def test_a_descriptor_is_not_pieced_together_across_skipped_bytes() -> None:
     last = encode_standard_node(40 * 115, 0xA500, 15, False)
     noise = bytes(40)
@@ -307,6 +319,14 @@ def test_an_answer_ends_a_stream(scan_type: AnswerType) -> None:
     first, second, *others = packets(scan_type, range(100, 8000, 600), random.Random(6))
     old = encode_descriptor(scan_type) + first + second
     assert feed([old + encode_answer(health) + b"".join(others)])[-1] == health
+
+
+@pytest.mark.parametrize("scan_type", CHECKED)
+def test_what_cannot_begin_a_packet_does_not_delay_an_answer(scan_type: AnswerType) -> None:
+    old = packets(scan_type, range(100, 2000, 600), random.Random(6))
+    events = feed([encode_descriptor(scan_type) + b"".join(old) + b"\0" + encode_answer(GOOD)])
+    assert events[-1] == GOOD
+    assert len(events) == 3
 
 
 def test_a_cut_packet_or_answer_no_longer_delays_the_next_one_once_discarded() -> None:

@@ -71,6 +71,7 @@ def test_an_hq_packet_round_trips(device_time: int, sent: list[Node]) -> None:
 
 
 @given(angles_q6, spans_q6, each(32, st.integers(0, 16383)), each(32, st.integers(0, 63)))
+@example(TURN_Q6 - 5, 32, [1000] * 32, [0] * 32)  # a sample is taken at 0
 def test_an_express_capsule_round_trips(
     start_q6: int, span_q6: int, distances_mm: list[int], offsets_q3: list[int]
 ) -> None:
@@ -161,10 +162,24 @@ def test_ultra_distances_are_rounded_as_by_the_peer(stem: str) -> None:
 
 
 def test_ultra_differences_below_zero_are_no_return() -> None:
-    words = np.full(32, 100 | (-101 & 0x3FF) << 12 | (-100 & 0x3FF) << 22, "<u4").tobytes()
+    assert ultra_threes(100, -101, -100) == [[400, 0, 0]] * 32
+
+
+def test_both_marks_of_no_return_in_ultra_are_read() -> None:
+    assert ultra_threes(2000, -511, 510) != ultra_threes(2000, -512, 511)
+    assert [three[1:] for three in ultra_threes(2000, -512, 511)] == [[0, 0]] * 32
+    assert [three[1:] for three in ultra_threes(2000, 511, -512)] == [[0, 0]] * 32
+
+
+def ultra_threes(major: int, difference1: int, difference2: int) -> list[list[int]]:
+    """Distances [mm/4] of a packet that has the same word everywhere."""
+    word = major | (difference1 & 0x3FF) << 12 | (difference2 & 0x3FF) << 22
+    words = np.full(32, word, "<u4").tobytes()
     first, following = framed(start_word(0, True) + words), framed(start_word(1000, False) + words)
-    samples = decode(AnswerType.ULTRA_SCAN, first, following)
-    assert samples.distance_q2.reshape(-1, 3).tolist() == [[400, 0, 0]] * 32
+    threes: list[list[int]] = (
+        decode(AnswerType.ULTRA_SCAN, first, following).distance_q2.reshape(-1, 3).tolist()
+    )
+    return threes
 
 
 @pytest.mark.parametrize(
@@ -213,6 +228,21 @@ def test_near_targets_of_ultra_dense_are_smoothed_as_in_the_sdk(
     for chunks in (sent, [b"".join(sent)]):
         events = feed([encode_descriptor(AnswerType.ULTRA_DENSE_SCAN), *chunks])
         assert [q2 for _, q2, _, _ in nodes(events)] == expected
+
+
+def test_smoothing_does_not_reach_across_a_gap() -> None:
+    def sent(start_q6: int, distance_mm: int) -> bytes:
+        return encode_ultra_dense_capsule(start_q6, False, [distance_mm] * 64, [7] * 64, 0)
+
+    # without the third packet the second cannot be decoded either
+    lost = [sent(0, 1000), sent(1000, 1002), sent(12_000, 1002), sent(13_000, 1002)]
+    cut = [sent(0, 1000), sent(1000, 1002), sent(2000, 1000)[:-9], sent(3000, 1002), sent(4000, 1002)]
+    for chunks in (lost, [b"".join(lost)], cut, [b"".join(cut)]):
+        first, second = feed([encode_descriptor(AnswerType.ULTRA_DENSE_SCAN), *chunks])[1:]
+        assert isinstance(first, Samples)
+        assert isinstance(second, Samples)
+        assert set(first.distance_q2.tolist()) == {4000}
+        assert set(second.distance_q2.tolist()) == {4008}
 
 
 def ultra_dense(start_q6: int, span_q6: int, distances_mm: list[int], qualities: list[int]) -> Samples:
