@@ -27,6 +27,8 @@ from estimators.messages import PoseEstimate
 
 LONGEST_WAIT = 0.02
 """The loop looks at the dialogues of its devices at least this often [s]."""
+CLOSING_PAUSE = 0.01
+"""After each of the last words to a device [s]."""
 DROPS_PERIOD_NS = 5_000_000_000
 """The operator hears of dropped chunks at most this often."""
 
@@ -114,7 +116,8 @@ class LiveRun:
             closing = threading.Event()
             finder = Finder(address, table.driver, closing)
             return Port(name, finder, finder, self._inbox.put, closing)
-        return Port(name, address, lambda: SerialWire(address), self._inbox.put)
+        dtr_stops = self._chain.sensors[name].DTR_STOPS
+        return Port(name, address, lambda: SerialWire(address, dtr_stops), self._inbox.put)
 
     def _wait_and_take(self) -> None:
         """Wait for the next event or tick, then take what every port has waiting for its turn."""
@@ -184,7 +187,9 @@ class LiveRun:
 
     def _close(self) -> None:
         for name, sensor in self._chain.sensors.items():
-            self._send(name, sensor.closing())
+            for data in sensor.closing():
+                self._send(name, data)
+                time.sleep(CLOSING_PAUSE)
         for port in self._ports.values():
             port.close()
         if self._link is not None:

@@ -186,7 +186,9 @@ class Finder:
         self._address = address
         self._driver = driver
         self._closing = closing
-        self._bauds = list(new_sensor(driver).BAUDS) if address.baud is None else [address.baud]
+        sensor = new_sensor(driver)
+        self._bauds = list(sensor.BAUDS) if address.baud is None else [address.baud]
+        self._dtr_stops = sensor.DTR_STOPS
         self._found = ""
 
     def __str__(self) -> str:
@@ -217,7 +219,7 @@ class Finder:
             for path in paths:
                 if path not in verdicts:
                     try:
-                        wires[path] = SerialWire(PortAddress(path, self._bauds[0]))
+                        wires[path] = SerialWire(PortAddress(path, self._bauds[0]), self._dtr_stops)
                     except OpenError as error:
                         refusals.append(error)
                         verdicts[path] = str(error)

@@ -60,6 +60,7 @@ class LinkTrack:
         )
 
     MEASURES: ClassVar[frozenset[type]] = frozenset({RangeFrame, ImuSample, Attitude})
+    DTR_STOPS: ClassVar[bool] = False
     BAUDS: ClassVar[tuple[int, ...]] = (
         921_600,
         115_200,
@@ -76,8 +77,7 @@ class LinkTrack:
         self.stats = DecodeStats()
         self._latency_ns = round(config.latency_ms * 1e6)
         self._tag_id = config.tag_id
-        self._first_tag_id: int | None = None
-        self._several_tags = False
+        self._tag_ids: set[int] = set()  # heard, until there are two
         self._clock = DeviceClock(tick_ns=1_000_000, wrap=2**32)
         self._buffer = ByteBuffer(self.stats)
         self._awaited = 0  # bytes without which nothing is to be said about those that wait
@@ -89,7 +89,10 @@ class LinkTrack:
             if isinstance(frame, _Measuring):
                 measured_ns = self._clock.stamp(frame.local_time_ms, stamp_ns) - self._latency_ns
                 found += measurements(frame, measured_ns)
-        return [m for m in found if not isinstance(m, RangeFrame) or self._is_wanted(m.tag_id)]
+        if self._tag_id is not None:
+            return [m for m in found if not isinstance(m, RangeFrame) or m.tag_id == self._tag_id]
+        self._look_for_second_tag(found)
+        return found
 
     def frames(self, data: bytes) -> list[Frame]:
         """The whole frames that `data` completes, in order; for those who want more than measurements."""
@@ -130,24 +133,20 @@ class LinkTrack:
         """Nothing to ask; a wrong write can disable a module."""
         return b""
 
-    def closing(self) -> bytes:
+    def closing(self) -> list[bytes]:
         """Nothing to stop."""
-        return b""
+        return []
 
-    def _is_wanted(self, tag_id: int) -> bool:
-        if self._tag_id is not None:
-            return tag_id == self._tag_id
-        if self._first_tag_id is None:
-            self._first_tag_id = tag_id
-        elif tag_id != self._first_tag_id and not self._several_tags:
-            self._several_tags = True
+    def _look_for_second_tag(self, found: list[Measurement]) -> None:
+        if len(self._tag_ids) > 1:
+            return
+        self._tag_ids.update(m.tag_id for m in found if isinstance(m, RangeFrame))
+        if len(self._tag_ids) > 1:
             _logger.warning(
-                "LinkTrack: ranges of tag %d and of tag %d on one port, taken for one tag; "
-                "set tag_id to the number of the tag on this robot",
-                self._first_tag_id,
-                tag_id,
+                "LinkTrack: ranges of tags %s on one port are taken for those of one tag; "
+                "set tag_id to the tag on this robot",
+                ", ".join(map(str, sorted(self._tag_ids))),
             )
-        return True
 
 
 def measurements(frame: Frame, stamp_ns: int) -> list[Measurement]:

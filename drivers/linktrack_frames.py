@@ -9,9 +9,8 @@ Source: NLink V1.4; nlink_unpack @1b79045; LinkTrack User Manual V2.3, chapters 
 import re
 
 from drivers.linktrack_layouts import BlockFrame, FixedFrame, FrameLayout, PayloadFrame, TagTable, UserFrame
-from drivers.linktrack_records import Characters, Float32, Integer, Record, Slot
+from drivers.linktrack_records import Float32, Integer, RawBytes, Record, Slot
 from drivers.linktrack_types import (
-    VOID_ID,
     AnchorFrame0,
     AnchorRange,
     AoaNodeFrame0,
@@ -28,7 +27,6 @@ from drivers.linktrack_types import (
     NodeFrame5,
     NodeFrame6,
     NodeRange,
-    Role,
     SettingFrame0,
     SystemFrame0,
     TagBlock,
@@ -37,36 +35,6 @@ from drivers.linktrack_types import (
     TagRanges,
     UserFrame1,
 )
-
-__all__ = [
-    "VOID_ID",
-    "AnchorFrame0",
-    "AnchorRange",
-    "AoaNodeFrame0",
-    "AoaNodeRange",
-    "ErrorBits",
-    "ErrorFrame0",
-    "Frame",
-    "NodeData",
-    "NodeFrame0",
-    "NodeFrame1",
-    "NodeFrame2",
-    "NodeFrame3",
-    "NodeFrame4",
-    "NodeFrame5",
-    "NodeFrame6",
-    "NodeRange",
-    "Role",
-    "SettingFrame0",
-    "SystemFrame0",
-    "TagBlock",
-    "TagFrame0",
-    "TagPosition",
-    "TagRanges",
-    "UserFrame1",
-    "decode",
-    "encode",
-]
 
 _U8, _U16, _U24, _U32, _F32 = Integer("B"), Integer("H"), Integer("HB"), Integer("I"), Float32()
 _LENGTH, _SPEED, _ANGLE = Integer("Hb", 1000), Integer("Hb", 10000), Integer("h", 100)
@@ -81,14 +49,11 @@ _LONGEST_NODE_FRAME4 = 22 + 200 * (5 + 8 * 4)
 """200 tags with 8 anchors each, which is what LP_MODE2 allows."""
 
 # fmt: off
-_NODE_RANGE = Record(NodeRange, 7, [
+_RANGE = [
     Slot("role", 0, _U8), Slot("id", 1, _U8), Slot("dis", 2, _LENGTH),
     Slot("fp_rssi", 5, _POWER), Slot("rx_rssi", 6, _POWER),
-])
-_TIMED_NODE_RANGE = Record(NodeRange, 13, [
-    Slot("role", 0, _U8), Slot("id", 1, _U8), Slot("dis", 2, _LENGTH),
-    Slot("fp_rssi", 5, _POWER), Slot("rx_rssi", 6, _POWER),
-])
+]
+_NODE_RANGE, _PADDED_NODE_RANGE = Record(NodeRange, 7, _RANGE), Record(NodeRange, 13, _RANGE)
 _WIDE_NODE_RANGE = Record(NodeRange, 10, [
     Slot("role", 0, _U8), Slot("id", 1, _U32), Slot("dis", 5, _LENGTH),
     Slot("fp_rssi", 8, _POWER), Slot("rx_rssi", 9, _POWER),
@@ -129,7 +94,7 @@ _LAYOUT_OF_TYPE: dict[type[Frame], FrameLayout] = {
     ])),
     NodeFrame0: PayloadFrame(b"\x55\x02", Record(NodeFrame0, 11, [
         Slot("role", 4, _U8), Slot("id", 5, _U8),
-    ], rest="nodes"), _NODE_DATA, 2, Characters(), _LONGEST_USER_DATA, _LONGEST_USER_DATA),
+    ], rest="nodes"), _NODE_DATA, count_size=2, item=RawBytes(), longest=_LONGEST_USER_DATA),
     NodeFrame1: BlockFrame(b"\x55\x03", Record(NodeFrame1, 27, [
         Slot("role", 4, _U8), Slot("id", 5, _U8),
         Slot("system_time_ms", 6, _U32), Slot("local_time_ms", 10, _U32), Slot("voltage", 24, _VOLTAGE),
@@ -140,11 +105,11 @@ _LAYOUT_OF_TYPE: dict[type[Frame], FrameLayout] = {
         Slot("gyro", 40, _F32, (3,)), Slot("acc", 52, _F32, (3,)),
         Slot("angle_deg", 76, _ANGLE, (3,)), Slot("quat_wxyz", 82, _F32, (4,)),
         Slot("local_time_ms", 102, _U32), Slot("voltage", 116, _VOLTAGE),
-    ], rest="nodes"), _TIMED_NODE_RANGE),
+    ], rest="nodes"), _PADDED_NODE_RANGE),
     NodeFrame3: BlockFrame(b"\x55\x05", Record(NodeFrame3, 21, _SENDER, rest="nodes"), _NODE_RANGE),
     NodeFrame4: PayloadFrame(
         b"\x55\x06", Record(NodeFrame4, 21, _SENDER, rest="tags"), _TAG_RANGES,
-        1, _ANCHOR_RANGE, _MOST_ANCHORS, _LONGEST_NODE_FRAME4,
+        count_size=1, item=_ANCHOR_RANGE, most_items=_MOST_ANCHORS, longest=_LONGEST_NODE_FRAME4,
     ),
     AoaNodeFrame0: BlockFrame(
         b"\x55\x07", Record(AoaNodeFrame0, 21, _SENDER, rest="nodes"), _AOA_NODE_RANGE
@@ -155,7 +120,7 @@ _LAYOUT_OF_TYPE: dict[type[Frame], FrameLayout] = {
     ], rest="nodes"), _WIDE_NODE_RANGE),
     NodeFrame6: PayloadFrame(b"\x55\x09", Record(NodeFrame6, 14, [
         Slot("role", 4, _U8), Slot("id", 5, _U32),
-    ], rest="nodes"), _WIDE_NODE_DATA, 2, Characters(), _LONGEST_USER_DATA, _LONGEST_USER_DATA),
+    ], rest="nodes"), _WIDE_NODE_DATA, count_size=2, item=RawBytes(), longest=_LONGEST_USER_DATA),
     SettingFrame0: FixedFrame(b"\x54\x00", Record(SettingFrame0, 128, [
         Slot("mix", 2, _U8), Slot("role", 3, _U8), Slot("math_model", 4, Integer("B", void=255)),
         Slot("baud_rate", 5, _U24), Slot("system_channel", 8, _U8), Slot("id", 9, _U8),

@@ -10,7 +10,7 @@ import zlib
 from abc import ABC, abstractmethod
 from typing import Any
 
-from drivers.linktrack_records import Bytes, Characters, Record
+from drivers.linktrack_records import Bytes, RawBytes, Record
 from drivers.linktrack_types import VOID_ID, Role
 
 _MOST_BLOCKS = 255
@@ -27,6 +27,7 @@ class FrameLayout(ABC):
     def __init__(self, start: bytes, head: Record) -> None:
         self.start = start
         self._head = head
+        self._least = max(4, len(start))
 
     def extent(self, data: Bytes) -> int | None:
         """Length of the frame that starts `data`, or None when none can start so.
@@ -34,8 +35,8 @@ class FrameLayout(ABC):
         While it is more than `len(data)`, nothing is to be said before so many bytes are there. More bytes
         never turn None into a length: a refusal holds however the stream is cut.
         """
-        if len(data) < max(4, len(self.start)):
-            return max(4, len(self.start))
+        if len(data) < self._least:
+            return self._least
         return self._extent(data) if data.startswith(self.start) else None
 
     def decode(self, data: Bytes) -> Any | None:
@@ -127,8 +128,8 @@ class PayloadFrame(FrameLayout):
         block: fixed part of a block; its items are its rest.
         count_size: bytes of the count.
         item: one item.
-        most_items: of one block.
         longest: cap of the frame's length, because no count confirms it at once.
+        most_items: of one block; None: as many as fit.
     """
 
     def __init__(
@@ -136,17 +137,18 @@ class PayloadFrame(FrameLayout):
         start: bytes,
         head: Record,
         block: Record,
+        *,
         count_size: int,
-        item: Record | Characters,
-        most_items: int,
+        item: Record | RawBytes,
         longest: int,
+        most_items: int | None = None,
     ) -> None:
         super().__init__(start, head)
         self._block = block
         self._count_size = count_size
         self._item = item
-        self._most_items = most_items
         self._longest = longest
+        self._most_items = longest if most_items is None else most_items
 
     def _extent(self, data: Bytes) -> int | None:
         length = data[2] | data[3] << 8
@@ -243,8 +245,8 @@ class TagTable(FrameLayout):
         self._blocks = slice(len(start), len(start) + self._PLACES * block.size)
 
     def _extent(self, data: Bytes) -> int | None:
-        # Only this type has no checksum. Looking at each role as it arrives, besides, ends the wait for 896
-        # bytes early after a false start.
+        # Without a checksum, the roles are the guard. Looking at each as it arrives also ends the wait after
+        # a false start early.
         ids, roles = data[self._blocks][:: self._block.size], data[self._blocks][1 :: self._block.size]
         if any(role != Role.TAG and id_ != VOID_ID for id_, role in zip(ids, roles, strict=False)):
             return None

@@ -45,7 +45,7 @@ class ErrorBits(IntFlag):
     DATA_TOO_LONG = 1 << 7
 
 
-# Blocks are named tuples, because there are many of them and they are built in a third of the time.
+# Blocks are named tuples: there are many of them, and a dataclass takes 2.5 times as long to build.
 
 
 class NodeRange(NamedTuple):

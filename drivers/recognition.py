@@ -97,7 +97,7 @@ class Ear:
         self.data += data
         for driver, sensor in self._sensors.items():
             sensor.feed(data, stamp_ns)
-            if _frames(sensor) >= _CERTAIN_FRAMES and _frames(sensor) > sensor.stats.bad:
+            if sensor.stats.good >= max(_CERTAIN_FRAMES, sensor.stats.bad + 1):
                 return driver
         return None
 
@@ -105,15 +105,11 @@ class Ear:
         """Who spoke, now that nothing more comes; None when nobody is known by these bytes."""
         for driver, sensor in self._sensors.items():
             # A slow sensor sends a single frame in this time; then little else may have come.
-            if _frames(sensor) and 2 * sensor.stats.skipped_bytes <= len(self.data):
+            if sensor.stats.good and 2 * sensor.stats.skipped_bytes <= len(self.data):
                 return driver
         if find_heartbeat(self.data):
             return MAVLINK
         return NMEA if find_nmea(self.data) else None
-
-
-def _frames(sensor: Sensor) -> int:
-    return sensor.stats.good + sensor.stats.other
 
 
 def _crc_x25(data: bytes) -> int:

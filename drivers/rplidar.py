@@ -124,6 +124,7 @@ class Rplidar:
             return self
 
     MEASURES: ClassVar[frozenset[type]] = frozenset({Scan})
+    DTR_STOPS: ClassVar[bool] = True  # A1
     BAUDS: ClassVar[tuple[int, ...]] = (115_200, 256_000, 460_800, 1_000_000)
 
     def __init__(self, config: Config) -> None:
@@ -183,7 +184,7 @@ class Rplidar:
         """The request that is due now, if any."""
         return self._dialogue.poll(now_ns)
 
-    def closing(self) -> bytes:
+    def closing(self) -> list[bytes]:
         """STOP, and the motor off if it was switched on from here."""
         return self._dialogue.closing()
 

@@ -65,7 +65,7 @@ class Capsules(ABC):
         The two need a common scale of angles. They have none when the second says (S) that the device
         restarted its encoder, when the head did not turn (a packet came twice), or when it turned farther
         than the slowest sampling and the fastest rotation of the mode give: then packets were lost whole, or
-        the head turned back. The SDK draws this line for dense packets alone, at 100 revolutions/s.
+        the head turned back. The SDK draws this line for the dense modes alone, at 100 revolutions/s.
 
         Args:
             packets: (n, PACKET_BYTES), n >= 1.

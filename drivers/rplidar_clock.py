@@ -16,7 +16,7 @@ _MS = 1_000_000
 _ENDLESS = 1 << 62  # samples are counted without wrapping
 _LATE_NS = 30 * _MS  # more than a host's usual jitter ...
 _LATE_FOR_NS = 300 * _MS  # ... for longer than its stalls
-_RATE_WINDOW_NS = 3000 * _MS
+_RATE_WINDOW_NS = 1500 * _MS
 _MAX_RATE_ERROR = 0.05  # `DeviceClock` learns smaller ones; a stall of 150 ms looks like this
 
 
@@ -33,6 +33,7 @@ class SampleClock:
     def __init__(self, sample_ns: int) -> None:
         self._sample_ns = sample_ns
         self._clock = DeviceClock(sample_ns, _ENDLESS)
+        self._measured_ns = 0
         self.restart()
 
     def restart(self) -> None:
@@ -80,7 +81,10 @@ class SampleClock:
             return
         self._window = (count, arrival_ns)
         measured_ns = (arrival_ns - began_ns) // (count - began)
-        if abs(measured_ns - self._sample_ns) > _MAX_RATE_ERROR * self._sample_ns:
+        # Twice: bytes that were lost in one window look like a longer duration.
+        confirmed = abs(measured_ns - self._measured_ns) <= _MAX_RATE_ERROR * measured_ns
+        self._measured_ns = measured_ns
+        if confirmed and abs(measured_ns - self._sample_ns) > _MAX_RATE_ERROR * self._sample_ns:
             _log.warning("RPLIDAR samples come every %d ns, not %d", measured_ns, self._sample_ns)
             self._sample_ns = measured_ns
             self._clock = DeviceClock(measured_ns, _ENDLESS)

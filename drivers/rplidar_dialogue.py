@@ -144,9 +144,9 @@ class Dialogue:
         self._deadline_ns = now_ns + self._turn.wait_ns
         return self._turn.request
 
-    def closing(self) -> bytes:
+    def closing(self) -> list[bytes]:
         """STOP, and the motor off if it was switched on from here."""
-        return encode_request(Command.STOP) + self._motor_off
+        return [encode_request(Command.STOP), *([self._motor_off] if self._motor_off else [])]
 
     def _converse(self) -> _Talk[None]:
         """Everything, over and over: whatever goes wrong, it starts again with STOP."""

@@ -6,15 +6,14 @@ No I/O and no time.
 import numpy as np
 
 from drivers.framing import ByteBuffer, DecodeStats
-from drivers.rplidar_nodes import NODE, TURN_Q6, BoolArray, NodeArray, node_angles, to_q14
+from drivers.rplidar_nodes import NODE, TURN_Q6, Angles, BoolArray, NodeArray, node_angles, to_q14
 from drivers.rplidar_protocol import DESCRIPTOR, DESCRIPTOR_BYTES, AnswerType, Event, Samples
-from estimators.messages import IntArray
 
 _NODE_BYTES = NODE.itemsize
 # A node's direction is corrected for the distance, so it jumps by up to 9 deg either way between a return
 # and none (seen on a real A1), on top of the step, which is 0.3 to 6 deg.
-_MAX_FALL_Q6 = 10 << 6
-_MAX_RISE_Q6 = 20 << 6
+_FALL, _RISE, _TURN = np.uint16(10 << 6), np.uint16(20 << 6), np.uint16(TURN_Q6)
+_WRAPPED = np.uint16(65536 - 2 * TURN_Q6 + (10 << 6) + (20 << 6))
 _TRUSTED_NODES = 4  # this many in a row end a search; by chance random bytes pass once in some 10^6
 _RUN_BYTES = _TRUSTED_NODES * _NODE_BYTES
 _TAIL_BYTES = 2 * _NODE_BYTES - 1  # a descriptor at the first byte of a node never makes two
@@ -35,7 +34,7 @@ class NodeStream:
         self._trusted = True
         self._gap = False
         self._arrived = 0
-        self._last_angle_q6: int | None = None
+        self._last_angle_q6: np.uint16 | None = None
         self._tail = b""  # end of what was taken; a descriptor may begin in it
 
     def step(self, buffer: ByteBuffer, fed: int, events: list[Event]) -> bytes | None:
@@ -47,13 +46,13 @@ class NodeStream:
             return None
         nodes = np.frombuffer(buffer.view[: count * _NODE_BYTES], NODE)
         angle_q6, good = node_angles(nodes)
-        before_q6 = int(angle_q6[0]) if self._last_angle_q6 is None else self._last_angle_q6
-        good[0] &= _rises(angle_q6[:1] - before_q6)[0]
+        if self._last_angle_q6 is not None:
+            good[0] &= _rises(angle_q6[:1] - self._last_angle_q6)[0]
         good[1:] &= _rises(angle_q6[1:] - angle_q6[:-1])
         taken = count if good.all() else int(good.argmin())
         if taken:
             self._tail = (self._tail + buffer.take(taken * _NODE_BYTES))[-_TAIL_BYTES:]
-            self._last_angle_q6 = int(angle_q6[taken - 1])
+            self._last_angle_q6 = angle_q6[taken - 1]
             self._give(nodes[:taken], angle_q6[:taken], fed - len(buffer), events)
         if taken < count:
             self._stats.bad += 1
@@ -68,14 +67,14 @@ class NodeStream:
         self._last_angle_q6 = None
         self._tail = b""
 
-    def _give(self, nodes: NodeArray, angle_q6: IntArray, end: int, events: list[Event]) -> None:
-        flags = nodes["flags"].astype(np.int64)
+    def _give(self, nodes: NodeArray, angle_q6: Angles, end: int, events: list[Event]) -> None:
+        flags = nodes["flags"].copy()
         samples = Samples(
             AnswerType.STANDARD_SCAN,
             to_q14(angle_q6),
             nodes["distance"].astype(np.int64),
-            flags >> 2 << 2,
-            flags & 1 == 1,
+            (flags & 0xFC).astype(np.int64),
+            (flags & 1).view(np.bool_),
             self._gap,
             self._arrived,
             end,
@@ -112,8 +111,14 @@ class NodeStream:
         return b""
 
 
-def _rises(step_q6: IntArray) -> BoolArray:
-    return (step_q6 + _MAX_FALL_Q6) % TURN_Q6 <= _MAX_FALL_Q6 + _MAX_RISE_Q6
+def _rises(step_q6: Angles) -> BoolArray:
+    """Whether steps from one angle within a turn to the next, modulo 65536, are such as the head makes.
+
+    Modulo a turn, steps from the largest fall to the largest rise. All that is done on 16 bits, where a step
+    past 0 appears as 65536 less a part of a turn.
+    """
+    ahead = step_q6 + _FALL
+    return (ahead <= _FALL + _RISE) | (ahead - _TURN <= _WRAPPED)
 
 
 def _find_run(data: bytes) -> int | None:

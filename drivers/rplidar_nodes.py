@@ -24,6 +24,8 @@ TURN_Q6 = 360 << 6
 NODE = np.dtype([("flags", "u1"), ("angle", "<u2"), ("distance", "<u2")])
 """A standard node: quality above the guard bits S and not S, angle_q6 above one that is 1, distance_q2."""
 NodeArray: TypeAlias = NDArray[np.void]
+Angles: TypeAlias = NDArray[np.uint16]
+"""Angles within a turn (q6), which 16 bits can hold."""
 
 _HQ_NODE = np.dtype([("angle", "<u2"), ("distance", "<u4"), ("quality", "u1"), ("flags", "u1")])
 _HQ_HEAD_BYTES = 9
@@ -41,7 +43,7 @@ class Decoded(NamedTuple):
     starts: BoolArray
 
 
-def to_q14(angle_q6: IntArray) -> IntArray:
+def to_q14(angle_q6: IntArray | Angles) -> IntArray:
     """Angles from -2 to 2 turns [1/64 deg] in [90/16384 deg], wrapped and rounded as the SDK does."""
     return _Q14.take(angle_q6)
 
@@ -65,11 +67,12 @@ def encode_standard_node(angle_q6: int, distance_q2: int, quality: int, start: b
     return struct.pack("<BHH", quality << 2 | (1 if start else 2), angle_q6 << 1 | 1, distance_q2)
 
 
-def node_angles(nodes: NodeArray) -> tuple[IntArray, BoolArray]:
+def node_angles(nodes: NodeArray) -> tuple[Angles, BoolArray]:
     """Angle (q6) of standard nodes, and whether guard bits and angle can be a node's."""
-    flags, words = nodes["flags"], nodes["angle"]
-    angle_q6 = (words >> 1).astype(np.int64)
-    return angle_q6, ((flags ^ flags >> 1) & words & 1 == 1) & (angle_q6 < TURN_Q6)
+    flags, words = nodes["flags"].copy(), nodes["angle"].copy()  # contiguous: many quick steps follow
+    angle_q6: Angles = words >> np.uint16(1)
+    guarded = (flags & 3) - np.uint8(1) < 2  # S or not S, and not both
+    return angle_q6, guarded & (words & 1 == 1) & (angle_q6 < TURN_Q6)
 
 
 def encode_hq_packet(

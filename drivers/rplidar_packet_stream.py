@@ -88,7 +88,7 @@ class PacketStream:
         size = self._format.PACKET_BYTES
         places = found[::size]
         count = int(places.argmin()) or len(places)  # the first is good; it is the least when all are
-        for descriptor in DESCRIPTOR.finditer(window, 0, count * size):
+        for descriptor in DESCRIPTOR.finditer(window, size, count * size):
             if descriptor.start() % size == 0:
                 return descriptor.start() // size
         return count

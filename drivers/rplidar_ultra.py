@@ -62,7 +62,7 @@ def _predicted(base: IntArray, level: IntArray, difference: IntArray) -> IntArra
     """Distances [mm] from rounded ones; 0 for those marked so, and for those below 0, which cannot be."""
     difference = difference.astype(np.int64)
     distance = base + (difference << level)
-    distance[difference ^ difference >> 63 == ~_NO_RETURN] = 0
+    distance[(difference ^ difference >> 63) == ~_NO_RETURN] = 0
     return np.maximum(distance, 0)
 
 
@@ -156,9 +156,10 @@ class UltraDenseCapsules(Capsules):
 
     def _smooth(self, distance_q2: IntArray, near: BoolArray) -> None:
         """Take the mean with the (smoothed) distance before where it differs little; in place."""
-        # Smoothing moves a distance by at most half the limit, so no others can come within it.
+        # Near distances are told in steps of the limit, and smoothing moves them by half of it at most: what
+        # is farther from the one before as it was told is also farther from it as it was smoothed.
         steps = np.abs(np.diff(distance_q2, prepend=self._last_q2))
-        candidates = np.flatnonzero(near & (steps <= _SMOOTHED_Q2 * 3 // 2)).tolist()
+        candidates = np.flatnonzero(near & (steps <= _SMOOTHED_Q2)).tolist()
         if candidates:
             values = distance_q2.tolist()
             values.append(self._last_q2)  # it is before the first one, at index -1

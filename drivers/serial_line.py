@@ -29,12 +29,14 @@ class SerialWire:
 
     Args:
         address: where the device is.
+        dtr_stops: whether the device is to be left with its DTR line on, see `Sensor.DTR_STOPS`.
 
     Raises:
         PortError: it cannot be opened; the message says why.
     """
 
-    def __init__(self, address: PortAddress) -> None:
+    def __init__(self, address: PortAddress, dtr_stops: bool = False) -> None:
+        self._dtr_stops = dtr_stops
         self._is_network = "socket://" in address.url
         timeout = NETWORK_BATCH if self._is_network else READ_TIMEOUT
         try:
@@ -93,8 +95,19 @@ class SerialWire:
         if isinstance(self._device, serial.Serial) and self._device.is_open:
             with suppress(OSError):
                 fcntl.ioctl(self._device.fileno(), termios.TIOCNXCL)
+            if self._dtr_stops:
+                self._leave_dtr_on()
         with suppress(OSError):
             self._device.close()
+
+    def _leave_dtr_on(self) -> None:
+        """The system turns DTR off when a line is closed, unless it is told not to hang up."""
+        with suppress(OSError, termios.error):
+            fd = self._device.fileno()
+            settings = termios.tcgetattr(fd)
+            settings[2] &= ~termios.HUPCL
+            termios.tcsetattr(fd, termios.TCSANOW, settings)
+            self._device.dtr = True
 
     def _claim(self, fd: int) -> None:
         """Keep out those who do not lock, and stay out where one of them did the same.

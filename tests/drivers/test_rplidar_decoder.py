@@ -341,16 +341,16 @@ def test_a_cut_packet_or_answer_no_longer_delays_the_next_one_once_discarded() -
 
 @pytest.mark.parametrize("scan_type", MODES)
 def test_discard_does_not_end_a_stream_that_goes_on(scan_type: AnswerType) -> None:
-    decoder = AnswerDecoder(DecodeStats())
     sent = packets(scan_type, range(100, 8000, 600), random.Random(8))
-    size = PACKET_BYTES[scan_type]
-    decoder.feed(encode_descriptor(scan_type) + b"".join(sent[:4]) + sent[4][: size // 2])
-    decoder.discard()
-    after = decoder.feed(sent[4][size // 2 :] + b"".join(sent[5:]))
     whole = feed([encode_descriptor(scan_type) + b"".join(sent)])
-    group = PACKET_SAMPLES[scan_type]
-    assert nodes(after) == nodes(whole)[5 * group :]
-    assert [event.gap for event in after if isinstance(event, Samples)] == [True]
+    half = PACKET_BYTES[scan_type] // 2
+    for rest in (sent[4][half:], b""):
+        decoder = AnswerDecoder(DecodeStats())
+        decoder.feed(encode_descriptor(scan_type) + b"".join(sent[:4]) + sent[4][:half])
+        decoder.discard()
+        after = decoder.feed(rest + b"".join(sent[5:]))
+        assert nodes(after) == nodes(whole)[5 * PACKET_SAMPLES[scan_type] :]
+        assert [event.gap for event in after if isinstance(event, Samples)] == [True]
 
 
 def test_answers_are_found_among_leftovers_and_text() -> None:

@@ -105,7 +105,7 @@ def test_each_generation_is_asked_made_to_turn_and_to_scan_in_its_best_mode(
     assert line.rplidar.info is not None
     assert encode_answer(line.rplidar.info) == line.device.answers[INFO]
     assert line.rplidar.health == GOOD
-    assert line.rplidar.closing() == STOP + off
+    assert line.rplidar.closing() == [STOP, *([off] if off else [])]
     assert len(scans) > 6
     source = line.device.scans[line.device.heard[-1]]
     # the oldest firmware does not say how long a sample takes, and is off by 1.6 % from what is assumed
@@ -125,7 +125,7 @@ def test_the_device_of_the_sdk_s_session_scans_as_with_the_sdk(stem: str) -> Non
     assert said[express(3)] == [line.device.scans[express(3)].descriptor.hex()]
     assert line.rplidar.mode == "Sensitivity"
     assert line.rplidar.info == DeviceInfo(0x2C, (1, 32), 6, "000102030405060708090A0B0C0D0E0F")
-    assert line.rplidar.closing() == STOP + pwm(0)
+    assert line.rplidar.closing() == [STOP, pwm(0)]
     assert len(scans) > 6
     np.testing.assert_allclose(np.median(np.diff(scans[-1].beam_times)), 63e-6, rtol=0.001)
 
@@ -141,7 +141,7 @@ def test_there_is_a_pause_after_stop_and_after_a_motor_command(make: Make, motor
 def test_nothing_is_said_without_a_port() -> None:
     rplidar = Rplidar(Rplidar.Config())
     assert rplidar.poll(T0_NS) == b""
-    assert rplidar.closing() == STOP
+    assert rplidar.closing() == [STOP]
 
 
 # motor
@@ -194,7 +194,7 @@ def test_the_motor_is_left_alone_without_an_accessory_board() -> None:
     line = Line(device)
     line.run(0.5)
     assert device.heard == [*ASK, RATE, FLAG, express(0)]
-    assert line.rplidar.closing() == STOP
+    assert line.rplidar.closing() == [STOP]
 
 
 # modes

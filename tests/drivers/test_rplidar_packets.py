@@ -52,6 +52,11 @@ def test_a_standard_node_round_trips(angle_q6: int, distance_q2: int, quality: i
     assert nodes([samples]) == [(angle_q6 * 256 // 90, distance_q2, quality * 4, int(start))]
 
 
+def test_a_standard_node_beyond_a_turn_is_none() -> None:
+    beyond = (encode_standard_node(TURN_Q6 + i, 4000, 15, False) for i in range(4))
+    assert nodes(feed([encode_descriptor(AnswerType.STANDARD_SCAN), *beyond])) == []
+
+
 @settings(max_examples=30)
 @given(
     st.integers(0, 2**64 - 1),
@@ -190,6 +195,11 @@ def test_ultra_beams_leave_as_the_optics_have_it(distance_mm: int, degrees: floa
     assert offset == pytest.approx(degrees, abs=0.1)
 
 
+def test_the_angle_of_a_near_beam_in_ultra_is_cut_not_rounded_down() -> None:
+    # k = 98361 // 400 = 245; 9150 - 64 * 245 - 245**3 // 98304 = -6679, of which a turn has 2 pi * 65536
+    assert ultra_offset_q16(np.array([100])).tolist() == [int(-6679 * 180 / 3.14159265)]
+
+
 @given(angles_q6, spans_q6, each(64, st.integers(2047, 65522)), each(64, st.integers(0, 255)))
 def test_an_ultra_dense_capsule_round_trips_for_far_targets(
     start_q6: int, span_q6: int, distances_mm: list[int], qualities: list[int]
@@ -209,6 +219,8 @@ near_walls = near.flatmap(lambda mm: each(64, st.integers(max(0, mm - 4), min(20
 
 
 @given(st.one_of(each(64, near), near_walls), st.booleans())
+@example([0, 2] * 32, True)
+@example([2, 4, 6, 8] * 16, True)
 def test_near_targets_of_ultra_dense_are_smoothed_as_in_the_sdk(
     distances_mm: list[int], in_two_packets: bool
 ) -> None:

@@ -76,6 +76,17 @@ def test_a_line_is_had_alone_by_whatever_name(tmp_path: Path, pty: Pty) -> None:
     wire(pty.link).close()
 
 
+@pytest.mark.parametrize("dtr_stops", [True, False])
+def test_the_dtr_line_outlives_the_port_where_it_stops_the_device(pty: Pty, dtr_stops: bool) -> None:
+    settings = termios.tcgetattr(pty.slave)
+    settings[2] |= termios.HUPCL  # as real lines have it
+    termios.tcsetattr(pty.slave, termios.TCSANOW, settings)
+    SerialWire(PortAddress(str(pty.path), 115_200), dtr_stops).close()
+    # A pseudo-terminal has no DTR line; what keeps it on is the absence of a hang-up at the close.
+    hangs_up = bool(termios.tcgetattr(pty.slave)[2] & termios.HUPCL)
+    assert hangs_up is not dtr_stops
+
+
 def test_another_program_is_named_with_its_pid(pty: Pty) -> None:
     with program("gpsd", USE, pty.path) as process:
         said = refusal(pty.link)

@@ -9,7 +9,8 @@ from functools import reduce
 from operator import xor
 from typing import TypeAlias
 
-from drivers.linktrack_frames import NodeFrame2, NodeRange, encode
+from drivers.linktrack_frames import encode
+from drivers.linktrack_types import NodeFrame2, NodeRange
 from drivers.rplidar_protocol import (
     AccBoardFlag,
     DeviceInfo,

@@ -11,7 +11,8 @@ import numpy as np
 
 from drivers import make_sensor, sensor_config_class
 from drivers.framing import DecodeStats
-from drivers.linktrack_frames import NodeFrame2, NodeRange, encode
+from drivers.linktrack_frames import encode
+from drivers.linktrack_types import NodeFrame2, NodeRange
 from drivers.rplidar_decoder import AnswerDecoder
 from drivers.rplidar_protocol import Event, Samples
 from estimators.messages import FloatArray, Measurement, Scan
