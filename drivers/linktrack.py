@@ -77,7 +77,8 @@ class LinkTrack:
         self.stats = DecodeStats()
         self._latency_ns = round(config.latency_ms * 1e6)
         self._tag_id = config.tag_id
-        self._tag_ids: set[int] = set()  # heard, until there are two
+        self._first_tag_id: int | None = None
+        self._second_tag_told = False
         self._clock = DeviceClock(tick_ns=1_000_000, wrap=2**32)
         self._buffer = ByteBuffer(self.stats)
         self._awaited = 0  # bytes without which nothing is to be said about those that wait
@@ -138,15 +139,20 @@ class LinkTrack:
         return []
 
     def _look_for_second_tag(self, found: list[Measurement]) -> None:
-        if len(self._tag_ids) > 1:
+        if self._second_tag_told:
             return
-        self._tag_ids.update(m.tag_id for m in found if isinstance(m, RangeFrame))
-        if len(self._tag_ids) > 1:
-            _logger.warning(
-                "LinkTrack: ranges of tags %s on one port are taken for those of one tag; "
-                "set tag_id to the tag on this robot",
-                ", ".join(map(str, sorted(self._tag_ids))),
-            )
+        for measurement in found:
+            if isinstance(measurement, RangeFrame) and measurement.tag_id != self._first_tag_id:
+                if self._first_tag_id is None:
+                    self._first_tag_id = measurement.tag_id
+                    continue
+                self._second_tag_told = True
+                _logger.warning(
+                    "LinkTrack: ranges of tags %s on one port are taken for those of one tag; "
+                    "set tag_id to the tag on this robot",
+                    ", ".join(map(str, sorted((self._first_tag_id, measurement.tag_id)))),
+                )
+                return
 
 
 def measurements(frame: Frame, stamp_ns: int) -> list[Measurement]:

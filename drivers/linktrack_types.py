@@ -156,7 +156,7 @@ class NodeData(NamedTuple):
     data: bytes
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Sender:
     """What a measuring frame says of the module that sent it.
 
@@ -175,7 +175,7 @@ class Sender:
     voltage: float
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class TagState(Sender):
     """What a tag knows of itself.
 
@@ -201,7 +201,7 @@ class TagState(Sender):
     quat_wxyz: Quaternion
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class AnchorFrame0(Sender):
     """Anchor_Frame0: what an anchor or a console knows of at most 30 tags.
 
@@ -211,7 +211,7 @@ class AnchorFrame0(Sender):
     nodes: tuple[TagBlock, ...]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class TagFrame0(TagState):
     """Tag_Frame0: a tag's state and distances.
 
@@ -221,7 +221,7 @@ class TagFrame0(TagState):
     dis: AnchorDistances
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class NodeFrame0:
     """Node_Frame0: user data that came over the air, of at most 255 nodes.
 
@@ -238,7 +238,7 @@ class NodeFrame0:
     nodes: tuple[NodeData, ...]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class NodeFrame1(Sender):
     """Node_Frame1: positions of at most 255 tags, at an anchor or a console.
 
@@ -248,7 +248,7 @@ class NodeFrame1(Sender):
     nodes: tuple[TagPosition, ...]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class NodeFrame2(TagState):
     """Node_Frame2: a tag's state and the ranges of this cycle, at most 255.
 
@@ -258,7 +258,7 @@ class NodeFrame2(TagState):
     nodes: tuple[NodeRange, ...]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class NodeFrame3(Sender):
     """Node_Frame3: the ranges of this cycle, at most 255.
 
@@ -268,7 +268,7 @@ class NodeFrame3(Sender):
     nodes: tuple[NodeRange, ...]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class NodeFrame4(Sender):
     """Node_Frame4: the ranges of all tags, at an anchor or a console.
 
@@ -278,7 +278,7 @@ class NodeFrame4(Sender):
     tags: tuple[TagRanges, ...]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class AoaNodeFrame0(Sender):
     """AOA Node_Frame0: ranges and bearings of this cycle, at most 255.
 
@@ -288,7 +288,7 @@ class AoaNodeFrame0(Sender):
     nodes: tuple[AoaNodeRange, ...]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class NodeFrame5(Sender):
     """Node_Frame5: the ranges of this cycle between modules with ids of 32 bits, at most 255.
 
@@ -300,7 +300,7 @@ class NodeFrame5(Sender):
     nodes: tuple[NodeRange, ...]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class NodeFrame6:
     """Node_Frame6: user data that came over the air between modules with ids of 32 bits.
 
@@ -317,7 +317,7 @@ class NodeFrame6:
     nodes: tuple[NodeData, ...]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class SettingFrame0:
     """Setting_Frame0: the settings of a module, as it answers a request to read them.
 
@@ -364,7 +364,7 @@ class SettingFrame0:
     anchors: tuple[Coordinates, ...]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class UserFrame1:
     """User_Frame1: data that a host has a data-transmission (DT) master send to a slave.
 
@@ -381,7 +381,7 @@ class UserFrame1:
     data: bytes
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class ErrorFrame0:
     """Error_Frame0: a module's complaint.
 
@@ -402,7 +402,7 @@ class ErrorFrame0:
     marks: tuple[int, int, int]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class SystemFrame0:
     """System_Common_Frame0: what a module is.
 
