@@ -142,15 +142,17 @@ class LinkTrack:
         if self._second_tag_told:
             return
         for measurement in found:
-            if isinstance(measurement, RangeFrame) and measurement.tag_id != self._first_tag_id:
-                if self._first_tag_id is None:
-                    self._first_tag_id = measurement.tag_id
-                    continue
+            if not isinstance(measurement, RangeFrame):
+                continue
+            if self._first_tag_id is None:
+                self._first_tag_id = measurement.tag_id
+            elif measurement.tag_id != self._first_tag_id:
                 self._second_tag_told = True
+                tags = {self._first_tag_id} | {m.tag_id for m in found if isinstance(m, RangeFrame)}
                 _logger.warning(
                     "LinkTrack: ranges of tags %s on one port are taken for those of one tag; "
                     "set tag_id to the tag on this robot",
-                    ", ".join(map(str, sorted((self._first_tag_id, measurement.tag_id)))),
+                    ", ".join(map(str, sorted(tags))),
                 )
                 return
 
