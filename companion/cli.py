@@ -22,6 +22,7 @@ from companion import __version__
 from companion.config import default_toml, load_config, params_dir
 from companion.doctor import app as doctor
 from companion.errors import UserError
+from companion.evaluate_cli import app as evaluate_app
 
 if TYPE_CHECKING:
     from companion.live import LiveRun, LiveStatus
@@ -40,6 +41,7 @@ app = typer.Typer(
     add_completion=False,
 )
 app.add_typer(doctor, name="doctor")
+app.add_typer(evaluate_app, name="evaluate")
 out = Console()
 err = Console(stderr=True, highlight=False)
 

@@ -75,6 +75,7 @@ class Setup:
         height: height of the body origin above the map's floor [m].
         height_sigma: standard deviation of `height` [m].
         level_sigma: standard deviation of roll and pitch [rad] of a robot that walks level.
+        landmarks: landmark id -> position (2,) [m], map frame; those that are known beforehand.
     """
 
     anchors: dict[int, FloatArray]
@@ -83,6 +84,7 @@ class Setup:
     height: float
     height_sigma: float
     level_sigma: float
+    landmarks: dict[int, FloatArray] = field(default_factory=dict)
 
     def height_to(self, anchor: FloatArray) -> float:
         """Height of an anchor above the tag [m]."""

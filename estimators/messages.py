@@ -113,6 +113,27 @@ class PoseIncrement:
     is_keyframe: bool
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class LandmarkFrame:
+    """Known landmarks as one look of a LiDAR or camera finds them, each already told from the others.
+
+    Attributes:
+        stamp_ns: measurement time.
+        landmark_ids: (N,) int64, ids as in `Setup.landmarks`.
+        ranges: (N,) float64 [m], horizontal distance from the body's origin to the landmark.
+        bearings: (N,) float64 [rad], direction of the landmark in the body frame, counter-clockwise from x.
+        range_sigma: standard deviation of every range [m].
+        bearing_sigma: standard deviation of every bearing [rad].
+    """
+
+    stamp_ns: int
+    landmark_ids: IntArray
+    ranges: FloatArray
+    bearings: FloatArray
+    range_sigma: float
+    bearing_sigma: float
+
+
 PLANAR = np.ix_([0, 1, 5], [0, 1, 5])
 """Rows and columns of (x, y, yaw) in the covariance of a PoseEstimate."""
 
@@ -150,7 +171,7 @@ class PoseEstimate:
         return self.cov[PLANAR]
 
 
-Measurement: TypeAlias = RangeFrame | Scan | ImuSample | Attitude | PoseIncrement
+Measurement: TypeAlias = RangeFrame | Scan | ImuSample | Attitude | PoseIncrement | LandmarkFrame
 
 
 def measurement_stamp_ns(measurement: Measurement) -> int:

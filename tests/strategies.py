@@ -8,6 +8,7 @@ from estimators.messages import (
     Attitude,
     FloatArray,
     ImuSample,
+    LandmarkFrame,
     Measurement,
     PoseIncrement,
     RangeFrame,
@@ -95,16 +96,20 @@ def pose_increments(draw: st.DrawFn, stamp_ns: int, reference_stamps: list[int])
 
 @st.composite
 def other_measurements(draw: st.DrawFn, stamp_ns: int) -> Measurement:
-    """Scans, inertial samples and attitudes with anything in them."""
+    """Scans, inertial samples, attitudes and landmarks with anything in them."""
     value = st.floats(allow_nan=True, allow_infinity=True)
     triple = st.lists(value, min_size=3, max_size=3)
-    kind = draw(st.integers(0, 2))
+    kind = draw(st.integers(0, 3))
     if kind == 0:
         return ImuSample(stamp_ns, np.array(draw(triple)), np.array(draw(triple)))
     if kind == 1:
         return Attitude(stamp_ns, np.array([draw(value), *draw(triple)]))
     count = draw(st.integers(0, 5))
     ranges = np.array(draw(st.lists(value, min_size=count, max_size=count)))
+    if kind == 2:
+        ids = np.array(draw(st.lists(_anchor_ids, min_size=count, max_size=count)), dtype=np.int64)
+        bearings = np.array(draw(st.lists(value, min_size=count, max_size=count)))
+        return LandmarkFrame(stamp_ns, ids, ranges, bearings, draw(value), draw(value))
     return Scan(stamp_ns, np.linspace(0.0, 6.0, count), ranges, np.linspace(0.0, 0.1, count), np.zeros(count))
 
 

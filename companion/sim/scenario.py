@@ -5,11 +5,19 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from pydantic import Field, field_validator
+from pydantic import Field, ValidationInfo, field_validator
 
 from companion.config import Config, Coordinate, Table, known, load_config, parse_toml, read_text, validated
 from companion.errors import UserError
+from companion.sim.gait import GaitTrajectory
 from companion.sim.lidar_models import LIDAR_MODELS
+from companion.sim.scenario_tables import (
+    GaitTable,
+    IncrementsTable,
+    LandmarksTable,
+    PaperTable,
+    RandomBoxesTable,
+)
 from companion.sim.trajectory import Trajectory
 from companion.sim.world import World
 
@@ -27,6 +35,7 @@ class WorldTable(Table):
     """Obstacles; the walls are those of the site file."""
 
     boxes: list[BoxTable] = Field(default_factory=list)
+    random_boxes: list[RandomBoxesTable] = Field(default_factory=list)
 
 
 class TrajectoryTable(Table):
@@ -116,6 +125,17 @@ class ScenarioFile(Table):
     lidar: LidarTable = Field(default_factory=LidarTable)
     imu: ImuTable = Field(default_factory=ImuTable)
     faults: list[FaultTable] = Field(default_factory=list)
+    gait: GaitTable | None = None
+    increments: IncrementsTable | None = None
+    landmarks: LandmarksTable | None = None
+    paper: PaperTable | None = None
+
+    @field_validator("landmarks")
+    @classmethod
+    def _without_bytes(cls, landmarks: LandmarksTable, info: ValidationInfo) -> LandmarksTable:
+        if info.data.get("increments") is None:
+            raise ValueError("no emulated device sends landmarks, they need a table [increments]")
+        return landmarks
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -137,7 +157,7 @@ class Scenario:
     config: Config
     seed: int
     world: World
-    trajectory: Trajectory
+    trajectory: Trajectory | GaitTrajectory
     rng: np.random.Generator
 
 
@@ -154,16 +174,16 @@ def load_scenario(path: Path, seed: int | None, sets: list[str]) -> Scenario:
     """
     file = validated(ScenarioFile, parse_toml(read_text(path), str(path)), str(path))
     config = load_config(path.parent / file.site, sets)
-    if len(config.site.walls) == 0 and not file.world.boxes:
+    if not (config.site.walls or file.world.boxes or file.world.random_boxes):
         raise UserError(f"{path}: the site has no walls and the scenario no boxes, the LiDAR sees nothing")
     for i, fault in enumerate(file.faults):
-        table = config.sensor.get(fault.sensor)
-        if table is None:
+        sensor = config.sensor.get(fault.sensor)
+        if sensor is None:
             raise UserError(
                 f"{path}: faults.{i}.sensor: no sensor {fault.sensor!r} in the site, there are: "
                 + ", ".join(config.sensor)
             )
-        if fault.kind == "protection_stop" and table.driver != "rplidar":
+        if fault.kind == "protection_stop" and sensor.driver != "rplidar":
             raise UserError(f"{path}: faults.{i}.kind: only an rplidar has a protection_stop")
     walk = file.trajectory
     start = config.setup().start
@@ -172,7 +192,7 @@ def load_scenario(path: Path, seed: int | None, sets: list[str]) -> Scenario:
     boxes = [(*b.centre, *b.size, float(np.deg2rad(b.yaw_deg)), b.height) for b in file.world.boxes]
     # The operator sets the robot down on its mark as well as the site file says, not better.
     placement = rng.standard_normal(3) * start.sigma
-    trajectory = Trajectory(
+    straight = Trajectory(
         walk.waypoints,
         walk.laps,
         walk.speed,
@@ -181,6 +201,9 @@ def load_scenario(path: Path, seed: int | None, sets: list[str]) -> Scenario:
         walk.rest,
         placement,
     )
+    for table in file.world.random_boxes:
+        boxes += table.draw(rng)
+    trajectory = GaitTrajectory(straight, walk.rest, file.gait, rng) if file.gait else straight
     if not np.allclose(trajectory.start, start.pose, atol=1e-3):
         x, y, yaw = trajectory.start
         raise UserError(

@@ -10,6 +10,7 @@ from estimators.base import Estimator, Report, Verdict
 from estimators.messages import (
     Attitude,
     ImuSample,
+    LandmarkFrame,
     Measurement,
     PoseEstimate,
     PoseIncrement,
@@ -231,8 +232,9 @@ def test_empty_frame_has_no_verdicts(name: str) -> None:
         Scan(2 * SECOND_NS, np.zeros(2), np.ones(2), np.array([0.0, 0.1]), np.zeros(2)),
         ImuSample(2 * SECOND_NS, np.full(3, np.nan), np.zeros(3)),
         Attitude(2 * SECOND_NS, np.zeros(4)),
+        LandmarkFrame(2 * SECOND_NS, np.array([0, 1]), np.ones(2), np.zeros(2), 0.03, 0.01),
     ],
-    ids=["empty scan", "scan", "imu", "attitude"],
+    ids=["empty scan", "scan", "imu", "attitude", "landmarks"],
 )
 def test_other_sensors_get_one_verdict(name: str, measurement: Measurement) -> None:
     estimator = started(name)

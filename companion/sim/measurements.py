@@ -1,0 +1,168 @@
+"""Measurements of a walk without bytes: increments, ranges and landmarks straight from the truth.
+
+For scenarios with a table `[increments]`. Devices and drivers are left out, so a trial takes a fraction of a
+second; what a measurement claims of its noise is what was drawn.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from companion.sim.ranging import draw_ranging
+from companion.sim.scenario import Scenario
+from companion.sim.scenario_tables import IncrementsTable, LandmarksTable
+from companion.sim.simulate import START_NS
+from estimators.base import Setup
+from estimators.geometry import between, rotation, transform_each, wrap_angle, wrap_angles
+from estimators.messages import FloatArray, IntArray, LandmarkFrame, PoseIncrement, RangeFrame
+
+TAG_ID = 1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MeasuredWalk:
+    """What the sensors of a scenario measured, and the truth.
+
+    Attributes:
+        stamps_ns: (K,) instants of the increments.
+        poses: (K, 3) true x [m], y [m], yaw [rad] at these, map frame.
+        increments: K, each from the instant before; the first only founds the reference.
+        range_frames: in stamp order.
+        unblocked: for every range frame the anchors whose range came straight.
+        landmark_frames: in stamp order.
+    """
+
+    stamps_ns: IntArray
+    poses: FloatArray
+    increments: list[PoseIncrement]
+    range_frames: list[RangeFrame]
+    unblocked: list[list[int]]
+    landmark_frames: list[LandmarkFrame]
+
+    def in_order(self) -> list[PoseIncrement | RangeFrame | LandmarkFrame]:
+        """All measurements in stamp order; of one instant the increment first, the landmarks last."""
+        every: list[PoseIncrement | RangeFrame | LandmarkFrame] = [*self.increments]
+        every += [*self.range_frames, *self.landmark_frames]
+        return sorted(every, key=lambda measurement: measurement.stamp_ns)
+
+
+def setup_of(scenario: Scenario) -> Setup:
+    """Geometry of the site, with the scenario's landmarks numbered from 0."""
+    landmarks = scenario.file.landmarks
+    positions = landmarks.positions if landmarks is not None else []
+    known = {i: np.array(position) for i, position in enumerate(positions)}
+    return replace(scenario.config.setup(), landmarks=known)
+
+
+def measure(scenario: Scenario) -> MeasuredWalk:
+    """Draw everything that is measured on the walk.
+
+    Args:
+        scenario: with a table `[increments]`; its generator is used up, load it anew for a second walk.
+    """
+    odometry, landmarks = scenario.file.increments, scenario.file.landmarks
+    assert odometry is not None
+    odometry_rng, uwb_rng, landmark_rng = scenario.rng.spawn(3)
+    stamps_ns, poses = _instants(scenario, odometry.rate)
+    range_frames, unblocked = _range_frames(scenario, uwb_rng)
+    return MeasuredWalk(
+        stamps_ns=stamps_ns,
+        poses=poses,
+        increments=_increments(odometry, odometry_rng, stamps_ns, poses),
+        range_frames=range_frames,
+        unblocked=unblocked,
+        landmark_frames=_landmark_frames(scenario, landmarks, landmark_rng) if landmarks else [],
+    )
+
+
+def _instants(scenario: Scenario, rate: float) -> tuple[IntArray, FloatArray]:
+    """Stamps (K,) of a sensor that measures regularly from the start, and true poses (K, 3)."""
+    count = int(scenario.trajectory.duration * rate) + 1
+    since_ns = np.array([round(k * 1e9 / rate) for k in range(count)], dtype=np.int64)
+    times: FloatArray = since_ns.astype(np.float64) * 1e-9
+    return START_NS + since_ns, scenario.trajectory.at(times).pose
+
+
+def _increments(
+    table: IncrementsTable, rng: np.random.Generator, stamps_ns: IntArray, poses: FloatArray
+) -> list[PoseIncrement]:
+    """Increments from each pose to the next.
+
+    Noise of a step is white. A trial's scale error and drift repeat in all of its steps; the covariance of a
+    step has their variance too, but nothing says that they are the same as in the step before.
+    """
+    sigma_yaw, drift_sigma = np.deg2rad(table.sigma_yaw_deg), np.deg2rad(table.yaw_drift_deg)
+    scale = table.scale_sigma * rng.standard_normal()
+    drift = drift_sigma * rng.standard_normal()
+    noise = rng.standard_normal((len(poses) - 1, 3)) * [table.sigma_x, table.sigma_y, sigma_yaw]
+    map_cov = np.diag([table.sigma_x**2, table.sigma_y**2])
+    increments = [
+        PoseIncrement(int(stamps_ns[0]), int(stamps_ns[0]), np.zeros(3), np.zeros((3, 3)), is_keyframe=True)
+    ]
+    for k, step_noise in enumerate(noise):
+        R_body_map = rotation(poses[k, 2]).T
+        step = between(poses[k], poses[k + 1])
+        length = float(np.hypot(step[0], step[1]))
+        value = step * [1.0 + scale, 1.0 + scale, 1.0]
+        value[:2] += R_body_map @ step_noise[:2]
+        value[2] = wrap_angle(value[2] + drift * length + step_noise[2])
+        cov = np.zeros((3, 3))
+        cov[:2, :2] = R_body_map @ map_cov @ R_body_map.T + table.scale_sigma**2 * np.outer(
+            step[:2], step[:2]
+        )
+        cov[2, 2] = sigma_yaw**2 + (drift_sigma * length) ** 2
+        from_ns, to_ns = stamps_ns[k : k + 2].tolist()
+        increments.append(PoseIncrement(from_ns, to_ns, value, cov, is_keyframe=True))
+    return increments
+
+
+def _range_frames(scenario: Scenario, rng: np.random.Generator) -> tuple[list[RangeFrame], list[list[int]]]:
+    """Ranges that err as those of the emulated tag do, and the anchors that it saw."""
+    uwb, config, world = scenario.file.uwb, scenario.config, scenario.world
+    stamps_ns, poses = _instants(scenario, uwb.rate)
+    ids = np.array(list(config.anchors), dtype=np.int64)
+    anchors = np.array(list(config.anchors.values()))
+    lever_arm = np.array(config.body.tag)
+    tag_height = np.full(len(poses), config.body.height + lever_arm[2])
+    tags = np.column_stack([transform_each(poses, lever_arm[None, :2]), tag_height])
+    clear = np.array([world.line_of_sight(tag, anchors) for tag in tags])
+    distances = np.linalg.norm(anchors - tags[:, None], axis=2)
+    drawn = draw_ranging(uwb, distances, clear, rng)
+    frames = [
+        RangeFrame(
+            stamp_ns,
+            TAG_ID,
+            ids[got],
+            drawn.ranges[k, got],
+            drawn.rx_power[k, got],
+            drawn.fp_power[k, got],
+        )
+        for k, (stamp_ns, got) in enumerate(zip(stamps_ns.tolist(), drawn.received, strict=True))
+    ]
+    return frames, [ids[row].tolist() for row in clear & drawn.received]
+
+
+def _landmark_frames(
+    scenario: Scenario, table: LandmarksTable, rng: np.random.Generator
+) -> list[LandmarkFrame]:
+    """Landmarks within range; nothing hides them."""
+    stamps_ns, poses = _instants(scenario, table.rate)
+    bearing_sigma = float(np.deg2rad(table.bearing_sigma_deg))
+    offsets = np.array(table.positions) - poses[:, None, :2]
+    distances = np.hypot(offsets[..., 0], offsets[..., 1])
+    ranges = distances + table.range_sigma * rng.standard_normal(distances.shape)
+    bearings = np.arctan2(offsets[..., 1], offsets[..., 0]) - poses[:, 2:]
+    bearings = wrap_angles(bearings + bearing_sigma * rng.standard_normal(distances.shape))
+    return [
+        LandmarkFrame(
+            stamp_ns,
+            np.flatnonzero(seen),
+            ranges[k, seen],
+            bearings[k, seen],
+            table.range_sigma,
+            bearing_sigma,
+        )
+        for k, (stamp_ns, seen) in enumerate(
+            zip(stamps_ns.tolist(), distances <= table.max_range, strict=True)
+        )
+    ]

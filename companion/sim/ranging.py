@@ -1,0 +1,50 @@
+"""How UWB ranges and their signal powers err."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from companion.sim.scenario import UwbTable
+from estimators.messages import FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Ranging:
+    """Ranges as a tag reports them, all arrays of one shape.
+
+    Attributes:
+        ranges: [m], slant.
+        received: False where the ranging failed.
+        rx_power: [dBm], of everything received.
+        fp_power: [dBm], of the first path.
+    """
+
+    ranges: FloatArray
+    received: NDArray[np.bool_]
+    rx_power: FloatArray
+    fp_power: FloatArray
+
+
+def draw_ranging(
+    uwb: UwbTable, distances: FloatArray, clear: NDArray[np.bool_], rng: np.random.Generator
+) -> Ranging:
+    """Ranges over true distances.
+
+    Args:
+        uwb: how they err.
+        distances: [m], of any shape.
+        clear: of the same shape; False where something stands between.
+        rng: source of noise.
+    """
+    noise = rng.standard_normal(distances.shape) * uwb.sigma
+    excess = uwb.nlos_least + rng.exponential(uwb.nlos_mean, distances.shape)
+    received = rng.random(distances.shape) >= uwb.dropout
+    # Free-space loss; what is blocked loses more, most of all on its first path.
+    rx_power = -72.0 - 20.0 * np.log10(np.maximum(distances, 0.1)) - np.where(clear, 0.0, 6.0)
+    return Ranging(
+        ranges=distances + noise + np.where(clear, 0.0, excess),
+        received=received,
+        rx_power=rx_power,
+        fp_power=rx_power - np.where(clear, 2.0, 11.0),
+    )

@@ -1,0 +1,98 @@
+"""Further tables of scenario files: random obstacles, gait, measurements without bytes, published figures."""
+
+from typing import Annotated, Self
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from companion.config import Coordinate, Table
+
+Box = tuple[float, float, float, float, float, float]
+Interval = tuple[Coordinate, Coordinate]
+Figure = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+
+
+class RandomBoxesTable(Table):
+    """Obstacles that stand somewhere else in every trial."""
+
+    count: int = Field(ge=1, le=100)
+    x: Interval = Field(description="least and greatest x of a centre [m], map frame")
+    y: Interval = Field(description="the same for y [m]")
+    side: Interval = Field((0.3, 0.6), description="least and greatest length of a side [m]")
+    height: float = Field(2.5, gt=0, le=10, description="[m]")
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        for name in ("x", "y", "side"):
+            least, greatest = getattr(self, name)
+            if least > greatest:
+                raise ValueError(f"{name}: least {least:g} is above greatest {greatest:g}")
+        if self.side[0] <= 0.0:
+            raise ValueError(f"side: a length must be above 0, got {self.side[0]:g}")
+        return self
+
+    def draw(self, rng: np.random.Generator) -> list[Box]:
+        """Boxes (centre x, centre y, length x, length y [m], yaw [rad], height [m]) of one trial."""
+        return [
+            (
+                rng.uniform(*self.x),
+                rng.uniform(*self.y),
+                rng.uniform(*self.side),
+                rng.uniform(*self.side),
+                rng.uniform(0.0, np.pi),
+                self.height,
+            )
+            for _ in range(self.count)
+        ]
+
+
+class GaitTable(Table):
+    """How a legged robot's body moves about its straight way while it walks; its phase is random."""
+
+    frequency: float = Field(2.0, gt=0, le=20, description="strides a second [Hz]")
+    sway: float = Field(0.01, ge=0, le=0.5, description="amplitude to the left and right [m]")
+    yaw_deg: float = Field(1.0, ge=0, le=45, description="amplitude of the heading [deg]")
+
+
+class IncrementsTable(Table):
+    """Odometry increments in place of a LiDAR. A scenario with this table has no bytes and no scans.
+
+    Noise is drawn anew at every step, along the axes of the map: what a scan matcher lacks is structure of
+    the room. Drift is drawn once a trial.
+    """
+
+    rate: float = Field(10.0, ge=1, le=200, description="increments (steps) a second [Hz]")
+    sigma_x: float = Field(0.01, gt=0, le=1, description="noise of a step along the map's x axis [m]")
+    sigma_y: float = Field(0.01, gt=0, le=1, description="noise of a step along the map's y axis [m]")
+    sigma_yaw_deg: float = Field(0.1, gt=0, le=45, description="noise of a step's turn [deg]")
+    scale_sigma: float = Field(0.0, ge=0, le=0.5, description="relative error of every length, a trial's")
+    yaw_drift_deg: float = Field(
+        0.0, ge=0, le=45, description="false turn for every metre walked, a trial's [deg/m]"
+    )
+
+
+class LandmarksTable(Table):
+    """Known landmarks, seen whole or not at all, in a scenario with `[increments]`."""
+
+    positions: list[tuple[Coordinate, Coordinate]] = Field(min_length=1, description="[m], map frame")
+    rate: float = Field(10.0, ge=1, le=200, description="looks a second [Hz]")
+    range_sigma: float = Field(0.03, gt=0, le=10, description="[m]")
+    bearing_sigma_deg: float = Field(0.7, gt=0, le=90, description="[deg]")
+    max_range: float = Field(8.0, gt=0, le=1000, description="[m]")
+
+
+class PaperFigures(Table):
+    """What a publication states of one estimator, under the names of our own figures."""
+
+    rmse_m: Figure | None = None
+    rmse_x_m: Figure | None = None
+    rmse_y_m: Figure | None = None
+    max_x_m: Figure | None = None
+    max_y_m: Figure | None = None
+
+
+class PaperTable(Table):
+    """Published figures, shown beside ours."""
+
+    source: str
+    estimators: dict[str, PaperFigures] = Field(description="by the name of our estimator that is meant")
