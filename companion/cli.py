@@ -1,6 +1,8 @@
 """The commands. Data goes to files or stdout, progress and messages to stderr."""
 
+import json
 import logging
+import os
 import signal
 import sys
 import threading
@@ -10,13 +12,14 @@ from contextlib import contextmanager
 from datetime import datetime
 from math import degrees
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 from rich.console import Console
 from rich.logging import RichHandler
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+from typer.core import TyperGroup
 
 from companion import __version__
 from companion.config import default_toml, load_config, params_dir
@@ -30,6 +33,16 @@ if TYPE_CHECKING:
 
 EXIT_BAD_INPUT = 2
 
+
+class _ScenarioUnlessNamed(TyperGroup):
+    """Commands of `evaluate`; whatever is none of them is meant for `evaluate scenario`."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        if args and args[0] not in {*self.commands, *ctx.help_option_names}:
+            args = ["scenario", *args]
+        return super().parse_args(ctx, args)
+
+
 app = typer.Typer(
     help="Indoor pose for a robot from LinkTrack UWB and RPLIDAR, sent to ArduPilot or PX4 as MAVLink.\n\n"
     "Start with [bold]companion demo[/]: it runs the whole chain without hardware. Then "
@@ -41,7 +54,7 @@ app = typer.Typer(
     add_completion=False,
 )
 app.add_typer(doctor, name="doctor")
-app.add_typer(evaluate_app, name="evaluate")
+app.add_typer(evaluate_app, name="evaluate", cls=_ScenarioUnlessNamed)
 out = Console()
 err = Console(stderr=True, highlight=False)
 
@@ -261,6 +274,61 @@ def replay(
     out.print(f"  written to {folder}: poses.tum, summary.json, config.toml, replay.rrd", highlight=False)
 
 
+@evaluate_app.command("scenario")
+def evaluate(
+    scenario: Scenario_,
+    trials: Annotated[int, typer.Option("--trials", min=1, metavar="N", help="Number of runs.")] = 30,
+    seed: Seed = None,
+    estimators: Annotated[
+        str | None,
+        typer.Option(
+            "--estimators",
+            metavar="A,B",
+            help="Estimators, NAME or NAME:PARAM; uwb_ls and lidar are the single sensors. "
+            "Default: uwb_ls,lidar,ekf.",
+        ),
+    ] = None,
+    json_file: Annotated[
+        Path | None, typer.Option("--json", metavar="FILE", help="Write the figures there, too.")
+    ] = None,
+    workers: Annotated[
+        int | None, typer.Option("--workers", min=1, metavar="N", help="Processes; default: one a core.")
+    ] = None,
+    sets: Sets = None,
+) -> None:
+    """Measure estimators on many trials of a scenario: errors, consistency, time, distance from the bound.
+
+    The word "scenario" may be left out: [bold]companion evaluate huang2024[/]. Trial k has the seed S + k
+    for everything random: obstacles, start, gait and noise. The same seed gives the same figures, times
+    excepted. Where the scenario holds figures of a paper, they stand below ours.
+    """
+    from companion.evaluation import DEFAULT_CHOICES, evaluate_scenario
+    from companion.evaluation_table import evaluation_notes, evaluation_table
+
+    choices = DEFAULT_CHOICES if estimators is None else estimators.split(",")
+    if json_file is not None and not json_file.parent.is_dir():
+        raise UserError(f"cannot write {json_file}: there is no folder {json_file.parent}")
+    with _progress() as progress:
+        bar = progress.add_task("trials", total=trials)
+        result = evaluate_scenario(
+            _scenario_path(scenario),
+            trials,
+            seed,
+            choices,
+            sets or [],
+            workers or os.cpu_count() or 1,
+            lambda: progress.advance(bar),
+        )
+    out.print(evaluation_table(result))
+    for line in evaluation_notes(result):
+        out.print(f"  {line}", highlight=False, soft_wrap=True)
+    if json_file is not None:
+        try:
+            json_file.write_text(json.dumps(result.to_json(), indent=2) + "\n", encoding="utf-8")
+        except OSError as error:
+            raise UserError(f"cannot write {json_file}: {error.strerror}") from error
+
+
 @app.command("dump-config")
 def dump_config(
     site: Annotated[
@@ -308,7 +376,12 @@ def _scenario_path(name: str) -> Path:
 def _load_scenario(name: str, seed: int | None, sets: list[str] | None) -> "Scenario":
     from companion.sim.scenario import load_scenario
 
-    return load_scenario(_scenario_path(name), seed, sets or [])
+    scenario = load_scenario(_scenario_path(name), seed, sets or [])
+    if scenario.file.increments is not None:
+        raise UserError(
+            f"{name}: a scenario with [increments] has no bytes, only `companion evaluate` runs it"
+        )
+    return scenario
 
 
 @contextmanager
