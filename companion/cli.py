@@ -23,6 +23,7 @@ from typer.core import TyperGroup
 
 from companion import __version__
 from companion.config import default_toml, load_config, params_dir
+from companion.doctor import app as doctor
 from companion.errors import UserError
 from companion.evaluate_cli import app as evaluate_app
 
@@ -52,6 +53,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     add_completion=False,
 )
+app.add_typer(doctor, name="doctor")
 app.add_typer(evaluate_app, name="evaluate", cls=_ScenarioUnlessNamed)
 out = Console()
 err = Console(stderr=True, highlight=False)
@@ -199,9 +201,10 @@ def emulate(scenario: Scenario_, seed: Seed = None, sets: Sets = None) -> None:
 
     loaded = _load_scenario(scenario, seed, sets)
     emulator = Emulator(loaded)
-    for port in emulator.ports:
-        out.print(f"{port.name}  {port.path}", highlight=False)
-    options = " ".join(f"--set sensor.{port.name}.port={port.path}" for port in emulator.ports)
+    for name, port in emulator.ports.items():
+        out.print(f"{name}  {port.path}", highlight=False)
+    out.file.flush()
+    options = " ".join(f"--set sensor.{name}.port={port.path}" for name, port in emulator.ports.items())
     site = _scenario_path(scenario).parent / loaded.file.site
     err.print("In another terminal:")
     err.print(f"  companion run --site {site.resolve()} {options}", soft_wrap=True)
@@ -424,8 +427,9 @@ def _status_line(status: "LiveStatus") -> str:
         f"sent {status.poses_sent}",
         f"autopilot {status.autopilot}" if status.autopilot is not None else "no autopilot heard",
     ]
-    if lost := status.dropped_chunks + status.stale_ticks:
-        parts.append(f"dropped {lost}")
+    parts += [f"{name} dropped {count}" for name, count in status.dropped.items() if count]
+    if status.stale_ticks:
+        parts.append(f"late {status.stale_ticks}")
     if health.reason:
         parts.append(health.reason)
     return "  ".join(parts)

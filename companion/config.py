@@ -1,7 +1,7 @@
 """Everything that can be set: site file, defaults and `--set`, checked before any port opens."""
 
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -77,7 +77,8 @@ class SensorTable(Table):
 
     driver: str = Field(description="one of " + ", ".join(SENSORS))
     port: str = Field(
-        description="serial device (/dev/ttyUSB0?baud=921600) or any pyserial URL (socket://host:port)"
+        description="serial device (/dev/ttyUSB0?baud=921600), any pyserial URL (socket://host:port), or "
+        "auto: the USB serial adapter on which the sensor speaks (auto:/dev/ttyUSB*: one of these)"
     )
     settings: Any = Field(
         default_factory=dict, validate_default=True, description="the driver's own settings"
@@ -86,7 +87,7 @@ class SensorTable(Table):
     @field_validator("driver")
     @classmethod
     def _known_driver(cls, driver: str) -> str:
-        return _known(driver, SENSORS, "driver")
+        return known(driver, SENSORS, "driver")
 
     @field_validator("port")
     @classmethod
@@ -117,7 +118,7 @@ class PipelineTable(Table):
     @field_validator("estimator")
     @classmethod
     def _known_estimator(cls, name: str) -> str:
-        return _known(name, ESTIMATORS, "estimator")
+        return known(name, ESTIMATORS, "estimator")
 
 
 class HealthTable(Table):
@@ -338,7 +339,12 @@ def _estimator_tables() -> type[Table]:
     return create_model("EstimatorTables", __base__=Table, **fields)
 
 
-def _known(name: str, table: dict[str, Any], what: str) -> str:
+def known(name: str, table: Mapping[str, Any], what: str) -> str:
+    """The name, if the table has it.
+
+    Raises:
+        ValueError: it has not; names those there are.
+    """
     if name not in table:
         raise ValueError(f"unknown {what} {name!r}, there are: {', '.join(table)}")
     return name

@@ -4,11 +4,10 @@ The loop logs every chunk before it is decoded and works in the order of the log
 the log goes through the same steps.
 """
 
-import queue
 import threading
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from companion.config import Config, MavlinkTable, SensorTable
@@ -20,13 +19,18 @@ from companion.mavlink.link import wire_opener
 from companion.mavlink.session import MavlinkSession
 from companion.pipeline import Chain, Tick, make_pipeline
 from companion.replay import tum_line
-from drivers.port import Port, PortEvent, PortStatus, SerialWire, parse_address
+from drivers.discovery import Finder
+from drivers.inbox import Inbox
+from drivers.port import AutoAddress, Port, PortEvent, PortStatus, parse_address
+from drivers.serial_line import SerialWire
 from estimators.messages import PoseEstimate
 
-QUEUE_LENGTH = 10_000
-"""Chunks that may wait for the loop: some ten seconds; what comes on top is dropped and counted."""
 LONGEST_WAIT = 0.02
 """The loop looks at the dialogues of its devices at least this often [s]."""
+CLOSING_PAUSE = 0.01
+"""After each of the last words to a device [s]."""
+DROPS_PERIOD_NS = 5_000_000_000
+"""The operator hears of dropped chunks at most this often."""
 
 
 @dataclass(slots=True)
@@ -38,7 +42,7 @@ class LiveStatus:
         health: its judgement, or None before the first tick.
         poses_sent: poses given to the link.
         autopilot: system id of the autopilot, None until it was heard.
-        dropped_chunks: chunks lost because the loop could not keep up.
+        dropped: chunks lost because the loop could not keep up, by port.
         stale_ticks: poses not sent because they were computed too late.
     """
 
@@ -46,8 +50,13 @@ class LiveStatus:
     health: Health | None = None
     poses_sent: int = 0
     autopilot: int | None = None
-    dropped_chunks: int = 0
+    dropped: dict[str, int] = field(default_factory=dict)
     stale_ticks: int = 0
+
+    @property
+    def dropped_chunks(self) -> int:
+        """Chunks lost on all ports together."""
+        return sum(self.dropped.values())
 
 
 class LiveRun:
@@ -63,9 +72,10 @@ class LiveRun:
     """
 
     def __init__(self, config: Config, folder: Path, say: Callable[[str], None]) -> None:
-        self.status = LiveStatus()
+        self._inbox = Inbox([*config.sensor, MAVLINK])
+        self.status = LiveStatus(dropped=self._inbox.dropped)
         self._say = say
-        self._queue: queue.Queue[PortEvent] = queue.Queue(QUEUE_LENGTH)
+        self._drops_said, self._drops_due_ns = 0, 0
         # First what may refuse its settings, so that a wrong call leaves no folder behind.
         self._link = self._make_link(config.mavlink)
         start_ns = time.monotonic_ns()
@@ -93,32 +103,27 @@ class LiveRun:
                 self._wait_and_take()
                 self._work(self._chain.advance(time.monotonic_ns()))
                 self._talk_to_devices()
+                self._say_drops()
         finally:
             self._close()
 
     def _make_link(self, table: MavlinkTable) -> Port | None:
-        return Port(MAVLINK, table.url, wire_opener(table), self._put) if table.url else None
+        return Port(MAVLINK, table.url, wire_opener(table), self._inbox.put) if table.url else None
 
     def _make_port(self, name: str, table: SensorTable) -> Port:
         address = parse_address(table.port)
-        return Port(name, address.url, lambda: SerialWire(address), self._put)
-
-    def _put(self, event: PortEvent) -> None:
-        try:
-            self._queue.put_nowait(event)
-        except queue.Full:
-            self.status.dropped_chunks += 1
+        if isinstance(address, AutoAddress):
+            closing = threading.Event()
+            finder = Finder(address, table.driver, closing)
+            return Port(name, finder, finder, self._inbox.put, closing)
+        dtr_stops = self._chain.sensors[name].DTR_STOPS
+        return Port(name, address, lambda: SerialWire(address, dtr_stops), self._inbox.put)
 
     def _wait_and_take(self) -> None:
-        """Wait for the next event or tick, then take all events that are there."""
+        """Wait for the next event or tick, then take what every port has waiting for its turn."""
         until_tick = (self._chain.next_tick_ns - time.monotonic_ns()) * 1e-9
-        try:
-            event = self._queue.get(timeout=min(max(until_tick, 0.0), LONGEST_WAIT) or 1e-4)
-            while True:
-                self._take(event)
-                event = self._queue.get_nowait()
-        except queue.Empty:
-            return
+        for event in self._inbox.take(min(max(until_tick, 0.0), LONGEST_WAIT)):
+            self._take(event)
 
     def _take(self, event: PortEvent) -> None:
         if isinstance(event, PortStatus):
@@ -173,9 +178,18 @@ class LiveRun:
         if data and self._ports[name].write(data):
             self._log.raw(RawChunk(name, Direction.OUT, time.monotonic_ns(), data))
 
+    def _say_drops(self) -> None:
+        now_ns = time.monotonic_ns()
+        if self.status.dropped_chunks > self._drops_said and now_ns >= self._drops_due_ns:
+            self._drops_said, self._drops_due_ns = self.status.dropped_chunks, now_ns + DROPS_PERIOD_NS
+            names = ", ".join(f"{name} {count}" for name, count in self.status.dropped.items() if count)
+            self._say(f"chunks dropped, they come faster than they can be used: {names}")
+
     def _close(self) -> None:
         for name, sensor in self._chain.sensors.items():
-            self._send(name, sensor.closing())
+            for data in sensor.closing():
+                self._send(name, data)
+                time.sleep(CLOSING_PAUSE)
         for port in self._ports.values():
             port.close()
         if self._link is not None:

@@ -130,14 +130,14 @@ class DeviceClock:
 
 def _slope_below(x: FloatArray, y: FloatArray) -> float:
     """Slope of the lower convex hull where it passes the mean of x; x ascending, N >= 2."""
-    hull: list[int] = []
-    for i in range(len(x)):
-        while len(hull) >= 2 and (
-            (y[hull[-1]] - y[hull[-2]]) * (x[i] - x[hull[-2]])
-            >= (y[i] - y[hull[-2]]) * (x[hull[-1]] - x[hull[-2]])
-        ):
-            hull.pop()
-        hull.append(i)
     middle = x.mean()
-    left, right = next((a, b) for a, b in pairwise(hull) if x[b] >= middle)
-    return float((y[right] - y[left]) / (x[right] - x[left]))
+    hull: list[tuple[float, float]] = []
+    for x2, y2 in zip(x.tolist(), y.tolist(), strict=True):  # plain floats: few points, much arithmetic
+        while len(hull) >= 2:
+            (x0, y0), (x1, y1) = hull[-2:]
+            if (y1 - y0) * (x2 - x0) < (y2 - y0) * (x1 - x0):
+                break
+            hull.pop()
+        hull.append((x2, y2))
+    (x0, y0), (x1, y1) = next(edge for edge in pairwise(hull) if edge[1][0] >= middle)
+    return float((y1 - y0) / (x1 - x0))

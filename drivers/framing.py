@@ -18,14 +18,12 @@ class DecodeStats:
     Attributes:
         good: frames decoded.
         bad: frames refused: wrong checksum, impossible length, impossible content.
-        other: whole frames of a type that this driver does not turn into measurements.
         skipped_bytes: bytes that belong to no frame.
         resyncs: how often a run of skipped bytes began.
     """
 
     good: int = 0
     bad: int = 0
-    other: int = 0
     skipped_bytes: int = 0
     resyncs: int = 0
 
@@ -35,6 +33,11 @@ class Sensor(Protocol):
 
     MEASURES: ClassVar[frozenset[type]]
     """Types of the measurements it makes."""
+    BAUDS: ClassVar[tuple[int, ...]]
+    """Rates at which its devices speak, the most usual first; for those whose port is looked for."""
+
+    DTR_STOPS: ClassVar[bool]
+    """Whether its motor stands while the port's DTR line is on."""
 
     stats: DecodeStats
 
@@ -50,8 +53,8 @@ class Sensor(Protocol):
         """Bytes to send to the device now; empty when there is nothing to say."""
         ...
 
-    def closing(self) -> bytes:
-        """Bytes that leave the device quiet when the port is about to be closed."""
+    def closing(self) -> list[bytes]:
+        """Writes, a pause after each, that leave the device quiet when the port is about to be closed."""
         ...
 
 

@@ -1,4 +1,4 @@
-"""Wire format of the SLAMTEC RPLIDAR: requests, answers and scan packets, encoded and decoded.
+"""Wire format of the SLAMTEC RPLIDAR: requests and answers, encoded and decoded.
 
 No I/O and no time. Angles on the wire are degrees clockwise seen from above, 0 is forward; integers carry
 their scale as the vendor writes it: ``_q6`` is 1/64, ``_q16`` 1/65536 degree, ``angle_q14`` is 90/16384
@@ -7,31 +7,34 @@ degree (65536 a turn), ``distance_q2`` is 1/4 mm.
 Source: Slamtec interface protocol rev 2.2 (chapters 2 to 4); rplidar_sdk @99478e5.
 """
 
+import re
 import struct
-from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
+from functools import reduce
+from operator import xor
 from typing import TypeAlias
 
-import numpy as np
-from numpy.typing import NDArray
-
 from drivers.framing import ByteBuffer, DecodeStats
+from drivers.rplidar_nodes import BoolArray
 from estimators.messages import IntArray
-
-BoolArray: TypeAlias = NDArray[np.bool_]
 
 
 class Command(IntEnum):
     """Request codes; bit 7 says that a payload follows. Source: sl_lidar_cmd.h."""
 
     SCAN = 0x20
+    FORCE_SCAN = 0x21
     STOP = 0x25
     RESET = 0x40
     GET_INFO = 0x50
     GET_HEALTH = 0x52
     GET_SAMPLERATE = 0x59
     EXPRESS_SCAN = 0x82
+    HQ_SCAN = 0x83
+    GET_LIDAR_CONF = 0x84
+    SET_LIDAR_CONF = 0x85
+    NEW_BAUDRATE_CONFIRM = 0x90
     HQ_MOTOR_SPEED_CTRL = 0xA8
     SET_MOTOR_PWM = 0xF0
     GET_ACC_BOARD_FLAG = 0xFF
@@ -43,9 +46,36 @@ class AnswerType(IntEnum):
     INFO = 0x04
     HEALTH = 0x06
     SAMPLERATE = 0x15
+    LIDAR_CONF = 0x20
+    SET_CONF = 0x21
     STANDARD_SCAN = 0x81
     EXPRESS_SCAN = 0x82
+    HQ_SCAN = 0x83
+    ULTRA_SCAN = 0x84
+    DENSE_SCAN = 0x85
+    ULTRA_DENSE_SCAN = 0x86
     ACC_BOARD_FLAG = 0xFF
+
+
+class ConfKey(IntEnum):
+    """What GET_LIDAR_CONF can ask for; those named MODE ask it of one scan mode. Source: sl_lidar_cmd.h."""
+
+    ANGLE_RANGE = 0x00
+    DESIRED_ROTATION = 0x01
+    SCAN_COMMANDS = 0x02
+    MIN_ROTATION = 0x04
+    MAX_ROTATION = 0x05
+    MAX_DISTANCE = 0x60
+    MODE_COUNT = 0x70
+    MODE_SAMPLE_TIME = 0x71
+    MODE_MAX_DISTANCE = 0x74
+    MODE_ANSWER_TYPE = 0x75
+    MAC_ADDRESS = 0x79
+    TYPICAL_MODE = 0x7C
+    MODE_NAME = 0x7F
+    MODEL_REVISION = 0x80
+    MODEL_NAME = 0x81
+    DETECTED_BAUD = 0xA1
 
 
 class HealthStatus(IntEnum):
@@ -60,22 +90,29 @@ PACKET_BYTES = {
     AnswerType.INFO: 20,
     AnswerType.HEALTH: 3,
     AnswerType.SAMPLERATE: 4,
+    AnswerType.SET_CONF: 8,
     AnswerType.STANDARD_SCAN: 5,
     AnswerType.EXPRESS_SCAN: 84,
+    AnswerType.HQ_SCAN: 781,
+    AnswerType.ULTRA_SCAN: 132,
+    AnswerType.DENSE_SCAN: 84,
+    AnswerType.ULTRA_DENSE_SCAN: 170,
     AnswerType.ACC_BOARD_FLAG: 4,
 }
-"""Length of the one answer, or of each packet of a scan stream."""
+"""Length of the one answer, or of each packet of a scan stream; that of LIDAR_CONF is in its descriptor."""
 
-PACKET_SAMPLES = {AnswerType.STANDARD_SCAN: 1, AnswerType.EXPRESS_SCAN: 32}
+CONF_BYTES = range(4, 256)
+"""Lengths of a LIDAR_CONF answer: the key it is of, and at most 251 bytes of value."""
+
+PACKET_SAMPLES = {
+    AnswerType.STANDARD_SCAN: 1,
+    AnswerType.EXPRESS_SCAN: 32,
+    AnswerType.HQ_SCAN: 96,
+    AnswerType.ULTRA_SCAN: 96,
+    AnswerType.DENSE_SCAN: 40,
+    AnswerType.ULTRA_DENSE_SCAN: 64,
+}
 """Samples in each packet, for the answers that are streams."""
-
-NODE_BYTES = PACKET_BYTES[AnswerType.STANDARD_SCAN]
-CAPSULE_BYTES = PACKET_BYTES[AnswerType.EXPRESS_SCAN]
-_CAPSULE_SAMPLES = PACKET_SAMPLES[AnswerType.EXPRESS_SCAN]
-_SAMPLE_INDEX = np.arange(_CAPSULE_SAMPLES)
-_CABIN = np.dtype([("words", "<u2", (2,)), ("nibbles", "u1", (1,))])  # two samples
-_NIBBLES = np.array([0, 4], np.uint8)
-TURN_Q6 = 360 << 6
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,6 +161,81 @@ class AccBoardFlag:
 
 
 @dataclass(frozen=True, slots=True)
+class LidarConf:
+    """Answer to GET_LIDAR_CONF.
+
+    It does not say of which scan mode it is. Each property reads the value of one key, and is None for any
+    other key and for a value that is too short or impossible.
+
+    Attributes:
+        key: that was asked for, see `ConfKey`.
+        data: its value as on the wire.
+    """
+
+    key: int
+    data: bytes
+
+    @property
+    def desired_rotation(self) -> tuple[int, int] | None:
+        """Speed that the device is made for: revolutions per minute, motor PWM (0..1023)."""
+        values = self._unpack(ConfKey.DESIRED_ROTATION, "<HH")
+        return None if values is None else (values[0], values[1])
+
+    @property
+    def mode_count(self) -> int | None:
+        """How many scan modes there are; they are numbered from 0."""
+        return self._number(ConfKey.MODE_COUNT, "<H")
+
+    @property
+    def typical_mode(self) -> int | None:
+        """Scan mode that the vendor recommends."""
+        return self._number(ConfKey.TYPICAL_MODE, "<H")
+
+    @property
+    def sample_ns(self) -> int | None:
+        """Time that the mode takes for one sample [ns]."""
+        us_q8 = self._number(ConfKey.MODE_SAMPLE_TIME, "<I")
+        return round(us_q8 * 1000 / 256) if us_q8 else None
+
+    @property
+    def max_distance(self) -> float | None:
+        """Farthest target of the mode [m]."""
+        metres_q8 = self._number(ConfKey.MODE_MAX_DISTANCE, "<I")
+        return metres_q8 / 256 if metres_q8 else None
+
+    @property
+    def answer_type(self) -> AnswerType | None:
+        """Kind of the mode's packets."""
+        number = self._number(ConfKey.MODE_ANSWER_TYPE, "<B")
+        return AnswerType(number) if number in PACKET_SAMPLES else None
+
+    @property
+    def mode_name(self) -> str | None:
+        """What the vendor calls the mode."""
+        text = self.data.partition(b"\0")[0]
+        if self.key != ConfKey.MODE_NAME or not text or not text.isascii():
+            return None
+        return text.decode("ascii")
+
+    def _number(self, key: ConfKey, layout: str) -> int | None:
+        values = self._unpack(key, layout)
+        return None if values is None else values[0]
+
+    def _unpack(self, key: ConfKey, layout: str) -> tuple[int, ...] | None:
+        if self.key != key or len(self.data) < struct.calcsize(layout):
+            return None
+        return struct.unpack_from(layout, self.data)
+
+
+@dataclass(frozen=True, slots=True)
+class ConfSet:
+    """Answer to SET_LIDAR_CONF: the key that was set, and the vendor's result code, 0 for done."""
+
+    key: int
+    result: int
+
+
+@dataclass(frozen=True, slots=True)
 class ScanStarted:
     """Descriptor of a scan stream: samples of this type follow, unrelated to earlier ones."""
 
@@ -138,12 +250,15 @@ class Samples:
         scan_type: kind of the packets they came in.
         angle_q14: (N,) int64 [90/16384 deg], clockwise from forward.
         distance_q2: (N,) int64 [mm/4]; 0 where nothing came back.
-        quality: (N,) int64, as the SDK scales it: the device's 0..63 times 4; in express packets, which
-            carry none, 188 with a return and 0 without.
+        quality: (N,) int64, 0..255 as the SDK gives it: in standard scans the device's 0..63 times 4; in
+            express, ultra and dense packets, which carry none, 188 with a return and 0 without.
         starts: (N,) bool, True at the first sample of a revolution.
-        gap: True when samples may be missing just before these.
-        end: how many bytes had been fed when the packet of the last sample was complete. It says in
-            which chunk that packet arrived, which for express is earlier than this event.
+        gap: True when samples may be missing just before these; there are none missing in between.
+        first: number of the first of these samples, counted from 0 at the scan's descriptor over all packets
+            that arrived. Times the sample duration it is a clock of the device that runs on between two
+            gaps; lost packets are not counted.
+        end: how many bytes had been fed when the packet of the last sample was complete. It says in which
+            chunk that packet arrived; where packets are decoded in pairs, that is before this event.
     """
 
     scan_type: AnswerType
@@ -152,10 +267,11 @@ class Samples:
     quality: IntArray
     starts: BoolArray
     gap: bool
+    first: int
     end: int
 
 
-Answer: TypeAlias = DeviceInfo | Health | SampleRate | AccBoardFlag
+Answer: TypeAlias = DeviceInfo | Health | SampleRate | AccBoardFlag | LidarConf | ConfSet
 Event: TypeAlias = Answer | ScanStarted | Samples
 
 
@@ -172,7 +288,13 @@ def encode_request(command: int, payload: bytes = b"") -> bytes:
     if len(payload) > 255:
         raise ValueError(f"payload of {len(payload)} bytes, at most 255 fit")
     packet = bytes((0xA5, command, len(payload))) + payload
-    return packet + bytes((xor_checksum(packet),))
+    return packet + bytes((_xor(packet),))
+
+
+def encode_conf_request(key: int, mode: int | None = None) -> bytes:
+    """GET_LIDAR_CONF for one key, and where it asks that of a scan mode, the mode's number."""
+    payload = struct.pack("<I", key) + (b"" if mode is None else struct.pack("<H", mode))
+    return encode_request(Command.GET_LIDAR_CONF, payload)
 
 
 class RequestDecoder:
@@ -195,7 +317,7 @@ class RequestDecoder:
             size = 4 + view[2] if has_payload else 2
             if len(view) < size:
                 return requests
-            if has_payload and xor_checksum(view[:size]):  # a checksum over itself gives 0
+            if has_payload and _xor(view[:size]):  # a checksum over itself gives 0
                 self.stats.bad += 1
                 self._buffer.skip(1)
                 continue
@@ -204,18 +326,38 @@ class RequestDecoder:
             requests.append((packet[1], packet[3:-1]))
 
 
-def encode_descriptor(answer_type: AnswerType) -> bytes:
-    """Descriptor that opens an answer. Source: protocol chapter 2."""
-    return descriptor_bytes(PACKET_BYTES[answer_type], answer_type in PACKET_SAMPLES, answer_type)
+def encode_descriptor(answer_type: AnswerType, packet_bytes: int | None = None) -> bytes:
+    """Descriptor that opens an answer.
+
+    Args:
+        answer_type: what follows.
+        packet_bytes: length of what follows; only for LIDAR_CONF, for the others it is fixed.
+
+    Source: protocol chapter 2.
+    """
+    if packet_bytes is None:
+        packet_bytes = PACKET_BYTES[answer_type]
+    repeated = answer_type in PACKET_SAMPLES
+    return b"\xa5\x5a" + struct.pack("<IB", packet_bytes | repeated << 30, answer_type)
 
 
-def descriptor_bytes(packet_bytes: int, repeated: bool, type_byte: int) -> bytes:
-    """Descriptor of any answer, known to `AnswerType` or not."""
-    return b"\xa5\x5a" + struct.pack("<IB", packet_bytes | repeated << 30, type_byte)
+DESCRIPTOR_BYTES = 7
+DESCRIPTOR = re.compile(
+    rb"\xa5\x5a(?:%b|[\x04-\xff]\x00\x00\x00\x20)"  # the last is LIDAR_CONF, with any of CONF_BYTES
+    % b"|".join(re.escape(encode_descriptor(answer_type)[2:]) for answer_type in PACKET_BYTES),
+    re.DOTALL,
+)
+"""Any known descriptor."""
 
 
 def encode_answer(answer: Answer) -> bytes:
-    """Descriptor and data of a single answer. Source: protocol chapter 4; sl_lidar_cmd.h."""
+    """Descriptor and data of a single answer.
+
+    Raises:
+        ValueError: a configuration value of more than 251 bytes.
+
+    Source: protocol chapter 4; sl_lidar_cmd.h.
+    """
     match answer:
         case DeviceInfo(model, (major, minor), hardware, serial):
             data = bytes((model, minor, major, hardware)) + bytes.fromhex(serial)
@@ -226,89 +368,38 @@ def encode_answer(answer: Answer) -> bytes:
             return encode_descriptor(AnswerType.SAMPLERATE) + struct.pack("<HH", standard_us, express_us)
         case AccBoardFlag(has_motor_pwm):
             return encode_descriptor(AnswerType.ACC_BOARD_FLAG) + struct.pack("<I", has_motor_pwm)
+        case LidarConf(key, value):
+            if 4 + len(value) not in CONF_BYTES:
+                raise ValueError(f"configuration value of {len(value)} bytes, at most 251 fit")
+            data = struct.pack("<I", key) + value
+            return encode_descriptor(AnswerType.LIDAR_CONF, len(data)) + data
+        case ConfSet(key, result):
+            return encode_descriptor(AnswerType.SET_CONF) + struct.pack("<II", key, result)
 
 
 def decode_answer(answer_type: AnswerType, data: bytes) -> Answer | None:
-    """Answer from its data; None when the content is impossible."""
-    if answer_type is AnswerType.INFO:
-        return DeviceInfo(data[0], (data[2], data[1]), data[3], data[4:].hex().upper())
-    if answer_type is AnswerType.HEALTH:
-        status, error_code = struct.unpack("<BH", data)
-        return Health(HealthStatus(status), error_code) if status <= HealthStatus.ERROR else None
-    if answer_type is AnswerType.SAMPLERATE:
-        return SampleRate(*struct.unpack("<HH", data))
-    return AccBoardFlag(bool(data[0] & 1))
+    """Answer from its data; None when length or content is impossible."""
+    if answer_type is AnswerType.LIDAR_CONF:
+        if len(data) not in CONF_BYTES:
+            return None
+        return LidarConf(int.from_bytes(data[:4], "little"), data[4:])
+    if len(data) != PACKET_BYTES[answer_type]:
+        return None
+    match answer_type:
+        case AnswerType.INFO:
+            return DeviceInfo(data[0], (data[2], data[1]), data[3], data[4:].hex().upper())
+        case AnswerType.HEALTH:
+            status, error_code = struct.unpack("<BH", data)
+            return Health(HealthStatus(status), error_code) if status <= HealthStatus.ERROR else None
+        case AnswerType.SAMPLERATE:
+            return SampleRate(*struct.unpack("<HH", data))
+        case AnswerType.SET_CONF:
+            return ConfSet(*struct.unpack("<II", data))
+        case AnswerType.ACC_BOARD_FLAG:
+            return AccBoardFlag(bool(data[0] & 1))
+        case _:  # scans are no single answers
+            return None
 
 
-def encode_standard_node(angle_q6: int, distance_q2: int, quality: int, start: bool) -> bytes:
-    """One sample of a standard scan; quality is 0..63. Source: protocol figure 4-4."""
-    return struct.pack("<BHH", quality << 2 | (1 if start else 2), angle_q6 << 1 | 1, distance_q2)
-
-
-def encode_express_capsule(
-    start_angle_q6: int, start_flag: bool, distances_mm: Sequence[int], offsets_q3: Sequence[int]
-) -> bytes:
-    """Packet of 32 samples of a legacy express scan.
-
-    Args:
-        start_angle_q6: 0..23039, direction when its first sample was taken.
-        start_flag: True on the first packet after a request, or after the encoder was restarted.
-        distances_mm: 32 values of 0..16383.
-        offsets_q3: 32 values of 0..63 [1/8 deg], subtracted from the evenly spaced directions.
-
-    Source: protocol figures 4-11 and 4-13; rplidar_sdk handler_capsules.cpp.
-    """
-    body = bytearray(struct.pack("<H", start_angle_q6 | start_flag << 15))
-    for i in range(0, _CAPSULE_SAMPLES, 2):
-        words = (distances_mm[k] << 2 | offsets_q3[k] >> 4 for k in (i, i + 1))
-        body += struct.pack("<HHB", *words, offsets_q3[i] & 15 | (offsets_q3[i + 1] & 15) << 4)
-    checksum = xor_checksum(body)
-    return bytes((0xA0 | checksum & 15, 0x50 | checksum >> 4)) + bytes(body)
-
-
-def decode_express_capsule(
-    capsule: bytes, next_capsule: bytes
-) -> tuple[IntArray, IntArray, IntArray, BoolArray]:
-    """Samples of one express packet; their directions are known once the next packet tells its own.
-
-    Args:
-        capsule: 84 bytes whose checksum holds.
-        next_capsule: the packet that followed without a gap.
-
-    Returns:
-        angle_q14, distance_q2, quality and starts, (32,) each, as in `Samples`. Integer arithmetic as in
-        the SDK, so that the values are equal to the bit.
-
-    Source: rplidar_sdk handler_capsules.cpp; protocol figure 4-13, whose signed offset is wrong.
-    """
-    cabins = np.frombuffer(capsule, _CABIN, offset=4)
-    words = cabins["words"].astype(np.int64).ravel()
-    offset_q3 = (words & 3) << 4 | (cabins["nibbles"] >> _NIBBLES & 15).ravel()
-    distance_q2 = words & ~3
-    # a step is 1/32 of the angle between the packets; q6 to q16 is 10 bits, so 5 bits remain
-    step_q16 = span_q6(capsule, next_capsule) << 5
-    raw_q16 = (_start_angle_q6(capsule) << 10) + step_q16 * _SAMPLE_INDEX
-    angle_q6 = (raw_q16 - (offset_q3 << 13)) >> 10
-    # A revolution starts where the direction before the offset is about to pass 0.
-    starts = (raw_q16 + step_q16) % (360 << 16) < step_q16
-    return to_q14(angle_q6), distance_q2, (distance_q2 > 0) * 188, starts
-
-
-def to_q14(angle_q6: IntArray) -> IntArray:
-    """Angles [1/64 deg] in [90/16384 deg], as the SDK reports them."""
-    return (angle_q6 % TURN_Q6 << 8) // 90
-
-
-def _start_angle_q6(capsule: bytes) -> int:
-    return (capsule[2] | capsule[3] << 8) & 0x7FFF
-
-
-def span_q6(capsule: bytes, next_capsule: bytes) -> int:
-    """Angle that the head turned while it took the samples of a capsule."""
-    span = _start_angle_q6(next_capsule) - _start_angle_q6(capsule)
-    return span if span >= 0 else span + TURN_Q6
-
-
-def xor_checksum(data: bytes | bytearray) -> int:
-    """All bytes combined by exclusive or."""
-    return int(np.bitwise_xor.reduce(np.frombuffer(data, np.uint8)))
+def _xor(data: bytes | bytearray) -> int:
+    return reduce(xor, data)

@@ -26,4 +26,5 @@ def load(stem: str) -> Any:
 
 def stream(stem: str) -> bytes:
     """The bytes that belong to the JSON file of that name."""
-    return (DIR / load(stem)["stream_file"]).read_bytes()
+    name: str = load(stem)["stream_file"]
+    return (DIR / name).read_bytes()

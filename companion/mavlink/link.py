@@ -1,6 +1,7 @@
 """The wire to the autopilot: any pymavlink device string. Bytes only, no parsing."""
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from pymavlink import mavutil
@@ -8,7 +9,8 @@ from pymavlink import mavutil
 from companion.config import MavlinkTable
 from companion.errors import UserError
 from drivers.errors import PortError
-from drivers.port import Wire, reason
+from drivers.port import OpenError, Wire, reason
+from drivers.port_advice import advice
 
 NAME = "mavlink"
 """Name of the link where sensors have theirs: in the log and in messages."""
@@ -32,7 +34,8 @@ class MavlinkWire:
             # One attempt: pymavlink's own retries print and sleep.
             self._connection = mavutil.mavlink_connection(table.url, baud=table.baud, retries=1)
         except OSError as error:
-            raise PortError(f"cannot open {table.url}: {reason(error)}") from error
+            advise = partial(advice, table.url, error)
+            raise OpenError(f"cannot open {table.url}: {reason(error)}", advise) from error
         # These have no other side that could close them; an empty read means nothing there.
         self._is_stream = not isinstance(
             self._connection, mavutil.mavudp | mavutil.mavmcast | mavutil.mavserial

@@ -1,37 +1,69 @@
 """Emulated devices on pseudo-terminals, in real time: what `companion run` can open instead of hardware."""
 
 import os
+import tempfile
 import threading
 import time
 import tty
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
+from pathlib import Path
 
-from companion.sim.devices import Device, Robot, make_devices
+from companion.sim.devices import make_lines
+from companion.sim.line import Line
+from companion.sim.robot import Robot
 from companion.sim.scenario import Scenario
 
 POLL_PERIOD = 0.002
 """Time between looks at the devices [s]."""
 
 
-@dataclass(frozen=True, slots=True)
 class PtyPort:
-    """A pseudo-terminal with a device on its far side.
+    """A pseudo-terminal with a device on its far side, under a path that outlives unplugging.
 
-    Attributes:
-        name: sensor name in the site file.
-        path: what the host opens.
-        master: file descriptor of the device's side.
-        slave: held open, so that the device outlives a host that closes its side.
-        device: the emulated device.
+    Args:
+        path: what the host opens; a link to the pseudo-terminal that is there while the plug is in.
+        line: to the device.
     """
 
-    name: str
-    path: str
-    master: int
-    slave: int
-    device: Device
+    def __init__(self, path: Path, line: Line) -> None:
+        self.path = path
+        self.line = line
+        self._master: int | None = None
+        self._slave = -1
+
+    def serve(self, now_ns: int) -> None:
+        """Carry over what host and device have sent."""
+        if not self.line.attached(now_ns):
+            self.close()
+            return
+        if self._master is None:
+            self._open()
+        master = self._master
+        assert master is not None
+        with suppress(BlockingIOError):
+            self.line.feed(os.read(master, 4096), now_ns)
+        data = self.line.poll(now_ns)
+        # When nobody reads: like a serial line, the pseudo-terminal loses what is not taken.
+        with suppress(BlockingIOError):
+            while data:
+                data = data[os.write(master, data) :]
+
+    def close(self) -> None:
+        """Let the pseudo-terminal vanish."""
+        if self._master is not None:
+            self.path.unlink()
+            os.close(self._slave)
+            os.close(self._master)
+            self._master = None
+
+    def _open(self) -> None:
+        # The device's side holds both ends open, so that it outlives a host that closes its own.
+        self._master, self._slave = os.openpty()
+        # Raw: a terminal would echo the scans back and turn some bytes into others.
+        tty.setraw(self._slave)
+        os.set_blocking(self._master, False)
+        self.path.symlink_to(os.ttyname(self._slave))
 
 
 class Emulator:
@@ -43,9 +75,14 @@ class Emulator:
 
     def __init__(self, scenario: Scenario) -> None:
         self.robot = Robot(scenario)
-        self.ports = [
-            _open_pty(name, device) for name, device in make_devices(self.robot, time.monotonic_ns()).items()
-        ]
+        self._folder = tempfile.TemporaryDirectory(prefix="companion-")
+        now_ns = time.monotonic_ns()
+        self.ports = {
+            name: PtyPort(Path(self._folder.name) / name, line)
+            for name, line in make_lines(self.robot, now_ns).items()
+        }
+        for port in self.ports.values():
+            port.serve(now_ns)
 
     def run(self, stop: threading.Event, say: Callable[[str], None]) -> None:
         """Serve until `stop` is set.
@@ -57,8 +94,8 @@ class Emulator:
         walking = over = False
         while not stop.wait(POLL_PERIOD):
             now_ns = time.monotonic_ns()
-            for port in self.ports:
-                _serve(port, now_ns)
+            for port in self.ports.values():
+                port.serve(now_ns)
             if not walking and self.robot.seconds(now_ns) > 0.0:
                 walking = True
                 say("the host asked for scans: the walk begins")
@@ -68,24 +105,6 @@ class Emulator:
 
     def close(self) -> None:
         """Close the pseudo-terminals."""
-        for port in self.ports:
-            os.close(port.master)
-            os.close(port.slave)
-
-
-def _open_pty(name: str, device: Device) -> PtyPort:
-    master, slave = os.openpty()
-    # Raw: a terminal would echo the scans back and turn some bytes into others.
-    tty.setraw(slave)
-    os.set_blocking(master, False)
-    return PtyPort(name, os.ttyname(slave), master, slave, device)
-
-
-def _serve(port: PtyPort, now_ns: int) -> None:
-    with suppress(BlockingIOError):
-        port.device.feed(os.read(port.master, 4096), now_ns)
-    data = port.device.poll(now_ns)
-    # When nobody reads: like a serial line, the pseudo-terminal loses what is not taken.
-    with suppress(BlockingIOError):
-        while data:
-            data = data[os.write(port.master, data) :]
+        for port in self.ports.values():
+            port.close()
+        self._folder.cleanup()

@@ -7,9 +7,10 @@ from typing import Literal
 import numpy as np
 from pydantic import Field, ValidationInfo, field_validator
 
-from companion.config import Config, Coordinate, Table, load_config, parse_toml, read_text, validated
+from companion.config import Config, Coordinate, Table, known, load_config, parse_toml, read_text, validated
 from companion.errors import UserError
 from companion.sim.gait import GaitTrajectory
+from companion.sim.lidar_models import LIDAR_MODELS
 from companion.sim.scenario_tables import (
     GaitTable,
     IncrementsTable,
@@ -51,7 +52,18 @@ class TrajectoryTable(Table):
 class UwbTable(Table):
     """The LinkTrack tag and how its ranges err."""
 
-    frame: Literal["node_frame2", "node_frame3", "tag_frame0"] = "node_frame2"
+    frame: Literal[
+        "node_frame2",
+        "node_frame3",
+        "tag_frame0",
+        "node_frame4",
+        "node_frame5",
+        "aoa_node_frame0",
+        "anchor_frame0",
+    ] = Field(
+        "node_frame2", description="what carries the ranges; node_frame4 and anchor_frame0: a console's"
+    )
+    other_traffic: bool = Field(False, description="user data, text and complaints on the same port")
     rate: float = Field(25.0, ge=1, le=200, description="frames a second [Hz]")
     sigma: float = Field(0.10, ge=0, le=5, description="standard deviation of a range [m]")
     nlos_least: float = Field(0.2, ge=0, le=10, description="least bias of a blocked range [m]")
@@ -62,13 +74,18 @@ class UwbTable(Table):
 class LidarTable(Table):
     """The RPLIDAR and how its ranges err."""
 
-    model: Literal["A1", "A2", "S1"] = "A2"
+    model: str = Field("A2", description="one of " + ", ".join(LIDAR_MODELS))
     rotation_hz: float = Field(10.0, ge=2, le=20, description="revolutions a second [Hz]")
     sigma: float = Field(0.015, ge=0, le=1, description="standard deviation of a distance [m]")
     dropout: float = Field(0.02, ge=0, lt=1, description="share of beams that return nothing")
     min_range: float = Field(0.15, ge=0, le=10, description="[m]")
     max_range: float = Field(12.0, gt=0, le=100, description="[m]")
     height: float = Field(0.1, ge=0, le=5, description="scan plane above the body origin [m]")
+
+    @field_validator("model")
+    @classmethod
+    def _known_model(cls, model: str) -> str:
+        return known(model, LIDAR_MODELS, "model")
 
 
 class ImuTable(Table):
@@ -77,6 +94,23 @@ class ImuTable(Table):
     gyro_sigma: float = Field(0.01, ge=0, le=1, description="[rad/s]")
     gyro_bias: float = Field(0.005, ge=0, le=1, description="standard deviation of the bias [rad/s]")
     accel_sigma: float = Field(0.05, ge=0, le=10, description="[m/s^2]")
+
+
+class FaultTable(Table):
+    """Something goes wrong with a sensor or its cable for a while."""
+
+    sensor: str = Field(description="name of the sensor in the site file")
+    kind: Literal[
+        "garbage", "truncation", "bit_flips", "stall", "silence", "disconnect", "protection_stop"
+    ] = Field(
+        description="random bytes between the device's own; the rest of a read lost; bits flipped; bytes "
+        "held back until the end; bytes lost; the plug pulled; the LiDAR stops itself with an error"
+    )
+    at: float = Field(gt=0, description="since the walk began [s]")
+    duration: float = Field(gt=0, le=3600, description="[s]")
+    share: float = Field(
+        0.1, gt=0, le=1, description="of bytes that are hit (bit_flips) or of reads (garbage, truncation)"
+    )
 
 
 class ScenarioFile(Table):
@@ -90,6 +124,7 @@ class ScenarioFile(Table):
     uwb: UwbTable = Field(default_factory=UwbTable)
     lidar: LidarTable = Field(default_factory=LidarTable)
     imu: ImuTable = Field(default_factory=ImuTable)
+    faults: list[FaultTable] = Field(default_factory=list)
     gait: GaitTable | None = None
     increments: IncrementsTable | None = None
     landmarks: LandmarksTable | None = None
@@ -141,6 +176,15 @@ def load_scenario(path: Path, seed: int | None, sets: list[str]) -> Scenario:
     config = load_config(path.parent / file.site, sets)
     if not (config.site.walls or file.world.boxes or file.world.random_boxes):
         raise UserError(f"{path}: the site has no walls and the scenario no boxes, the LiDAR sees nothing")
+    for i, fault in enumerate(file.faults):
+        sensor = config.sensor.get(fault.sensor)
+        if sensor is None:
+            raise UserError(
+                f"{path}: faults.{i}.sensor: no sensor {fault.sensor!r} in the site, there are: "
+                + ", ".join(config.sensor)
+            )
+        if fault.kind == "protection_stop" and sensor.driver != "rplidar":
+            raise UserError(f"{path}: faults.{i}.kind: only an rplidar has a protection_stop")
     walk = file.trajectory
     start = config.setup().start
     seed = file.seed if seed is None else seed

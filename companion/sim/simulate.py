@@ -5,7 +5,8 @@ from pathlib import Path
 
 from companion.log import Direction, LogWriter, RawChunk, Truth
 from companion.pipeline import make_sensors
-from companion.sim.devices import Robot, make_devices
+from companion.sim.devices import make_lines
+from companion.sim.robot import Robot
 from companion.sim.scenario import Scenario
 from drivers.framing import Sensor
 from estimators.messages import Scan
@@ -28,22 +29,27 @@ def converse(scenario: Scenario, sensors: Mapping[str, Sensor]) -> Iterator[RawC
         sensors: the drivers, by the site's sensor names.
     """
     robot = Robot(scenario)
-    devices = make_devices(robot, START_NS)
-    for sensor in sensors.values():
-        sensor.connected(START_NS)
+    lines = make_lines(robot, START_NS)
+    open_ports: set[str] = set()
     step, now_ns = 0, START_NS
     # A LiDAR that never scans would leave the robot waiting: the walk begins without it.
     if not any(Scan in sensor.MEASURES for sensor in sensors.values()):
         robot.begin(now_ns)
     while not robot.arrived(now_ns):
-        for name, device in devices.items():
-            data = device.poll(now_ns)
+        for name, line in lines.items():
+            if not line.attached(now_ns):
+                open_ports.discard(name)
+                continue
+            if name not in open_ports:
+                open_ports.add(name)
+                sensors[name].connected(now_ns)
+            data = line.poll(now_ns)
             if data:
                 yield RawChunk(name, Direction.IN, now_ns, data)
             request = sensors[name].poll(now_ns)
             if request:
                 yield RawChunk(name, Direction.OUT, now_ns, request)
-                device.feed(request, now_ns)
+                line.feed(request, now_ns)
         if step % TRUTH_EVERY == 0:
             yield Truth(now_ns, robot.motion(now_ns).pose[0])
         step += 1

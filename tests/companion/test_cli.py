@@ -95,6 +95,8 @@ def test_dump_config(tmp_path: Path) -> None:
         ["evaluate"],
         ["evaluate", "scenario"],
         ["dump-config"],
+        ["doctor"],
+        ["doctor", "ports"],
     ],
 )
 def test_help_teaches(tmp_path: Path, command: list[str]) -> None:
@@ -132,7 +134,7 @@ BAD_INPUT = {
     "link is a file": (["run", "--site", "demo_room", "--mavlink", "text.mcap"], "text.mcap is a file"),
     "unknown scenario": (
         ["emulate", "moon"],
-        "no file moon and none of that name in params/scenarios; there are: huang2024, ",
+        "no file moon and none of that name in params/scenarios; there are: hostile_room, huang2024, ",
     ),
     "unwritable log": (["simulate", "square_room", "--out", "text.mcap/log"], "cannot write the log"),
     "unwritable folder": (["demo", "--out", "text.mcap/demo"], "cannot write the log"),

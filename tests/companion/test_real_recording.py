@@ -11,7 +11,8 @@ from scipy.spatial.transform import Rotation
 from companion.config import load_config
 from companion.log import Direction, Log, LogWriter, RawChunk, Truth
 from companion.replay import Replay, config_of, replay
-from drivers.linktrack_frames import NodeFrame3, NodeRange, encode
+from drivers.linktrack_frames import encode
+from drivers.linktrack_types import NodeFrame3, NodeRange
 from estimators.base import Verdict
 
 DATA = Path(__file__).parent.parent / "data" / "lias_planar"

@@ -1,0 +1,90 @@
+"""The count of an RPLIDAR's samples as a clock, with the two faults that only arrivals show.
+
+No I/O and no clock of the host: arrivals go in, host times of samples come out.
+"""
+
+import logging
+
+import numpy as np
+
+from drivers.clock import DeviceClock
+from estimators.messages import IntArray
+
+_log = logging.getLogger(__name__)
+
+_MS = 1_000_000
+_ENDLESS = 1 << 62  # samples are counted without wrapping
+_LATE_NS = 30 * _MS  # more than a host's usual jitter ...
+_LATE_FOR_NS = 300 * _MS  # ... for longer than its stalls
+_RATE_WINDOW_NS = 1500 * _MS
+_MAX_RATE_ERROR = 0.05  # `DeviceClock` learns smaller ones; a stall of 150 ms looks like this
+
+
+class SampleClock:
+    """The count of samples as a clock: the device takes them at an even rate, and their arrivals set it.
+
+    Arrivals also show what the count cannot: samples that were lost without a trace, after which all seem
+    late; and a wrong sample duration, assumed or told (answers have no checksum).
+
+    Args:
+        sample_ns: time from one sample to the next [ns].
+    """
+
+    def __init__(self, sample_ns: int) -> None:
+        self._sample_ns = sample_ns
+        self._clock = DeviceClock(sample_ns, _ENDLESS)
+        self._measured_ns = 0
+        self.restart()
+
+    def restart(self) -> None:
+        """Samples were lost: their count has lost its relation to time."""
+        self._clock.restart()
+        self._late_since_ns: int | None = None
+        self._window: tuple[int, int] | None = None  # count and arrival at its beginning
+
+    def times_ns(self, first: int, end: int, newest: int, arrival_ns: int) -> IntArray:
+        """Host times of samples.
+
+        Args:
+            first: number of the first sample, counted from 0.
+            end: number of the last one, plus 1.
+            newest: how many samples had been taken when the bytes arrived.
+            arrival_ns: when that was, less the latency that is known.
+
+        Returns:
+            (end - first,) [ns].
+        """
+        self._check_rate(newest, arrival_ns)
+        self._clock.observe(newest, arrival_ns)
+        counts = np.arange(first + 1, end + 1)
+        times_ns = self._clock.host_times(counts)
+        if self._late_for_good(int(times_ns[-1]) + (newest - end) * self._sample_ns, arrival_ns):
+            self._clock.restart()
+            self._clock.observe(newest, arrival_ns)
+            times_ns = self._clock.host_times(counts)
+        return times_ns
+
+    def _late_for_good(self, newest_ns: int, arrival_ns: int) -> bool:
+        """Whether arrivals have been late for longer than a host is busy."""
+        if arrival_ns - newest_ns <= _LATE_NS:
+            self._late_since_ns = None
+        elif self._late_since_ns is None:
+            self._late_since_ns = arrival_ns
+        elif arrival_ns - self._late_since_ns > _LATE_FOR_NS:
+            self._late_since_ns = None
+            return True
+        return False
+
+    def _check_rate(self, count: int, arrival_ns: int) -> None:
+        began, began_ns = self._window = self._window or (count, arrival_ns)
+        if arrival_ns - began_ns < _RATE_WINDOW_NS or count == began:
+            return
+        self._window = (count, arrival_ns)
+        measured_ns = (arrival_ns - began_ns) // (count - began)
+        # Twice: bytes that were lost in one window look like a longer duration.
+        confirmed = abs(measured_ns - self._measured_ns) <= _MAX_RATE_ERROR * measured_ns
+        self._measured_ns = measured_ns
+        if confirmed and abs(measured_ns - self._sample_ns) > _MAX_RATE_ERROR * self._sample_ns:
+            _log.warning("RPLIDAR samples come every %d ns, not %d", measured_ns, self._sample_ns)
+            self._sample_ns = measured_ns
+            self._clock = DeviceClock(measured_ns, _ENDLESS)
