@@ -7,8 +7,10 @@ what ranges said of the keyframe's pose stays in the weights. In between, it mov
 """
 
 from abc import abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
 from math import isfinite
-from typing import ClassVar
+from typing import ClassVar, TypeAlias
 
 import numpy as np
 from pydantic import Field
@@ -32,6 +34,24 @@ POSE, VELOCITY, KEYFRAME, LAST = slice(0, 3), slice(3, 6), slice(6, 9), slice(9,
 _NO_RANGES, _NO_LANDMARKS = np.empty((0, 4)), np.empty((0, 6))
 
 
+Likelihood: TypeAlias = Callable[[FloatArray], FloatArray]
+"""Particles (N, 12) -> negative logarithm (N,) of how likely they make a measurement."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fixes:
+    """Ranges and landmarks that passed their gates, as `estimators.kernels` has them: a `Likelihood`."""
+
+    misfits: Callable[[FloatArray, FloatArray, FloatArray, FloatArray], FloatArray]
+    arm: FloatArray
+    ranges: FloatArray
+    landmarks: FloatArray
+
+    def __call__(self, particles: FloatArray) -> FloatArray:
+        """Misfits (N,) of particles (N, 3 or more)."""
+        return self.misfits(particles, self.arm, self.ranges, self.landmarks)
+
+
 class ParticleCloud(KeyframeTracker):
     """Motion, gating and output of every particle filter; how measurements change it is the subclass's.
 
@@ -52,11 +72,11 @@ class ParticleCloud(KeyframeTracker):
 
     def __init__(self, config: Config, setup: Setup) -> None:
         # Numba loads slowly: only who makes a filter waits for it.
-        from estimators.kernels import cloud, likelihood
+        from estimators.kernels import cloud, likelihood, motion
 
         super().__init__(config, setup)
-        self._cloud, self._likelihood = cloud, likelihood
-        self._usual_count = config.particles
+        self._cloud, self._likelihood, self._motion = cloud, likelihood, motion
+        self._count = config.particles
         self._seed = config.seed
         self._gate = RangeGate(config, setup)
         self._landmark_gate = float(chi2.ppf(config.landmark_gate, 1))
@@ -100,53 +120,46 @@ class ParticleCloud(KeyframeTracker):
         return PoseEstimate(stamp_ns, lift((F @ mean)[POSE], self._setup.height), cov, self._reset_counter)
 
     @abstractmethod
-    def _settle(
-        self, before: FloatArray, effective: float, ranges: FloatArray, landmarks: FloatArray
-    ) -> None:
-        """Do what follows when measurements have been taken into the weights.
+    def _take(self, misfits: FloatArray, measured: Likelihood) -> None:
+        """Take measurements into the cloud.
 
         Args:
-            before: (N,) weights without them.
-            effective: sample size with them.
-            ranges: (M, 4) as in `estimators.kernels`; those with infinite sigma do not count.
-            landmarks: (L, 6) likewise.
+            misfits: (N,) what `measured` says of the particles as they are.
+            measured: says the same of others.
         """
 
     def _place(self, pose: FloatArray, cov: FloatArray) -> None:
         self._gate.reset()
-        self._count = self._usual_count
         self._particles = np.zeros((self._count, 12))
         self._weights = np.full(self._count, 1.0 / self._count)
-        self._particles[:, POSE] = pose + self._noise_beside(POSE) @ _root(cov).T
+        self._particles[:, POSE] = pose + self._matched_noise() @ _root(cov).T
         self._particles[:, KEYFRAME] = self._particles[:, LAST] = self._particles[:, POSE]
         self._last_ns = self._stamp_ns or 0
 
-    def _noise_beside(self, columns: slice) -> FloatArray:
-        """Standard normal numbers (N, 3) beside columns of the particles, see `kernels.cloud.match`."""
-        noise = self._rng.standard_normal((self._count, 3))
-        self._cloud.match(noise, self._particles, self._weights, columns.start, columns.stop)
+    def _noise(self) -> FloatArray:
+        return self._rng.standard_normal((self._count, 3))
+
+    def _matched_noise(self) -> FloatArray:
+        noise = self._noise()
+        self._cloud.match(noise, self._particles, self._weights, POSE.start)
         return noise
 
     def _set_speed_free(self) -> None:
-        self._particles[:, VELOCITY] = START_SPEED_SIGMA * self._noise_beside(POSE)
+        self._particles[:, VELOCITY] = START_SPEED_SIGMA * self._matched_noise()
 
     def _move(self, dt: float) -> None:
         if dt > 0.0:
-            self._cloud.move(self._particles, self._noise_beside(POSE), dt, *self._accel_noise)
+            self._motion.move(self._particles, self._weights, self._noise(), dt, *self._accel_noise)
 
     def _follow(self, measured: PoseIncrement) -> Report:
-        residuals = self._cloud.increment_residuals(self._particles, measured.increment)
-        innovation = self._weights @ residuals
-        deviations = residuals - innovation
-        S = (self._weights * deviations.T) @ deviations + measured.cov
-        nis = float(innovation @ np.linalg.solve(S, innovation))
+        value, cov = measured.increment, measured.cov
+        nis = self._motion.increment_nis(self._particles, self._weights, value, cov)
         report = np.full(1, np.nan), np.array([nis])
         if nis > self._increment_gate:
             return Report((Verdict.GATED,), *report)
-        noise = self._noise_beside(KEYFRAME) @ _root(measured.cov).T
         assert self._stamp_ns is not None
         dt = (self._stamp_ns - self._last_ns) * 1e-9
-        self._cloud.follow(self._particles, measured.increment + noise, dt)
+        self._motion.follow(self._particles, self._weights, self._noise(), value, cov, dt)
         self._last_ns = self._stamp_ns
         return Report((Verdict.ACCEPTED,), *report)
 
@@ -173,16 +186,13 @@ class ParticleCloud(KeyframeTracker):
         ids: list[int] = frame.anchor_ids[used].tolist()
         ranges = np.array(rows)
         doubted = np.array([self._gate.doubts(anchor_id, frame.stamp_ns) for anchor_id in ids])
-        residuals = self._residuals(ranges, _NO_LANDMARKS)
-        innovations[used], nis[used] = self._likelihood.innovations(
-            residuals, self._weights, ranges[:, 3].copy(), self._gate.limit, doubted
+        innovations[used], nis[used], misfits = self._likelihood.gated_misfits(
+            self._particles, self._weights, self._arm, ranges, _NO_LANDMARKS, self._gate.limit, doubted
         )
         for k, i in enumerate(used):
             verdicts[i] = self._gate.judge(ids[k], frame.stamp_ns, float(nis[i]))
-            if verdicts[i] is not Verdict.ACCEPTED:
-                ranges[k, 3] = np.inf
         if Verdict.ACCEPTED in verdicts:
-            self._weigh(residuals, ranges, _NO_LANDMARKS)
+            self._take(misfits, Fixes(self._likelihood.misfits, self._arm, ranges, _NO_LANDMARKS))
         return Report(tuple(verdicts), innovations, nis)
 
     def _update_landmarks(self, frame: LandmarkFrame) -> Verdict:
@@ -197,26 +207,14 @@ class ParticleCloud(KeyframeTracker):
         landmarks = np.array([row for row in known if _is_possible(*row[2:])]).reshape(-1, 6)
         if len(landmarks) == 0:
             return Verdict.IMPOSSIBLE
-        residuals = self._residuals(_NO_RANGES, landmarks)
-        doubted = np.zeros(residuals.shape[1], dtype=np.bool_)
-        sigmas = landmarks[:, 4:].ravel()
-        _, nis = self._likelihood.innovations(residuals, self._weights, sigmas, self._landmark_gate, doubted)
-        passed = (nis.reshape(-1, 2) <= self._landmark_gate).all(axis=1)
-        if not passed.any():
+        doubted = np.zeros(2 * len(landmarks), dtype=np.bool_)
+        _, _, misfits = self._likelihood.gated_misfits(
+            self._particles, self._weights, self._arm, _NO_RANGES, landmarks, self._landmark_gate, doubted
+        )
+        if np.isinf(landmarks[:, 4]).all():
             return Verdict.GATED
-        landmarks[~passed, 4:] = np.inf
-        self._weigh(residuals, _NO_RANGES, landmarks)
+        self._take(misfits, Fixes(self._likelihood.misfits, self._arm, _NO_RANGES, landmarks))
         return Verdict.ACCEPTED
-
-    def _residuals(self, ranges: FloatArray, landmarks: FloatArray) -> FloatArray:
-        residuals: FloatArray = self._likelihood.residuals(self._particles, self._arm, ranges, landmarks)
-        return residuals
-
-    def _weigh(self, residuals: FloatArray, ranges: FloatArray, landmarks: FloatArray) -> None:
-        """Take measurements, as `estimators.kernels` has them; those with infinite sigma do not count."""
-        before = self._weights.copy()
-        effective = self._likelihood.reweigh(self._weights, residuals, sigmas_of(ranges, landmarks))
-        self._settle(before, effective, ranges, landmarks)
 
 
 def _root(cov: FloatArray) -> FloatArray:
@@ -234,8 +232,3 @@ def _is_possible(distance: float, bearing: float, range_sigma: float, bearing_si
         and 0.0 < range_sigma < np.inf
         and 0.0 < bearing_sigma < np.inf
     )
-
-
-def sigmas_of(ranges: FloatArray, landmarks: FloatArray) -> FloatArray:
-    """Standard deviations (M + 2 L,) of measurements, in the order of their residuals."""
-    return np.concatenate([ranges[:, 3], landmarks[:, 4:].ravel()])

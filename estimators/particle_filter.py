@@ -1,31 +1,22 @@
 """Particle filter with the motion as its proposal."""
 
-from math import sqrt
 from typing import Literal
 
 import numpy as np
 from pydantic import Field
 
 from estimators.base import Setup
-from estimators.geometry import wrap_angles
 from estimators.messages import FloatArray
-from estimators.particle_cloud import POSE, ParticleCloud, sigmas_of
+from estimators.particle_cloud import Likelihood, ParticleCloud
 from estimators.resampling import RESAMPLING
-
-MAX_HEADING_SIGMA = 0.35
-"""With a less certain heading [rad] a cloud is a ring, not a Gaussian, and needs more particles."""
-_LEAST_OF_A_RING = 500
-_SHARES_BELOW = 0.25
-"""Measurements that would leave a smaller share of effective particles are not taken at once."""
-_SHARE_LEAVES = 0.5
-"""Share of effective particles that each step leaves then."""
 
 
 class ParticleFilter(ParticleCloud):
     """Sequential importance resampling with three remedies for few particles.
 
-    Resampled particles are spread by a kernel that keeps their mean and covariance. Measurements that would
-    leave hardly any particle are taken a share at a time. Noise has the moments that it should have exactly.
+    Measurements that would leave too few effective particles are taken a share at a time, with resampling in
+    between. Resampled particles are spread by a kernel that keeps their mean and covariance. Noise has the
+    moments that it should have exactly.
 
     Source: Arulampalam et al., IEEE Trans. Signal Processing 50(2), 2002, Algorithm 4; weights huang2024
     Eq. (26) and (28); kernel: Liu and West, shares: Musso, Oudjane and Le Gland, both in Sequential Monte
@@ -37,7 +28,7 @@ class ParticleFilter(ParticleCloud):
 
         resampling: Literal["systematic", "stratified"] = Field("systematic", description="method")
         resample_below: float = Field(
-            0.5, gt=0, le=1, description="resample when the effective sample size is below this share"
+            0.5, gt=0, lt=1, description="resample when the effective sample size would fall below this share"
         )
         bandwidth: float = Field(
             1.0,
@@ -53,48 +44,22 @@ class ParticleFilter(ParticleCloud):
         self._bandwidth = config.bandwidth
         super().__init__(config, setup)
 
-    def _settle(
-        self, before: FloatArray, effective: float, ranges: FloatArray, landmarks: FloatArray
-    ) -> None:
-        count = max(self._usual_count, _LEAST_OF_A_RING) if self._is_ring(before) else self._usual_count
-        if count != self._count:
-            self._weights = before
-            self._resample(count)
-            self._weigh_in_shares(ranges, landmarks)
-        elif effective < _SHARES_BELOW * count:
-            self._weights = before
-            self._weigh_in_shares(ranges, landmarks)
-        elif effective < self._resample_below * count:
-            self._resample(count)
-
-    def _is_ring(self, weights: FloatArray) -> bool:
-        _, cov = self._cloud.moments(self._particles, weights, 3)
-        return bool(cov[2, 2] > MAX_HEADING_SIGMA**2)
-
-    def _weigh_in_shares(self, ranges: FloatArray, landmarks: FloatArray) -> None:
-        """Take measurements a share at a time, resampling in between."""
-        sigmas, left = sigmas_of(ranges, landmarks), 1.0
+    def _take(self, misfits: FloatArray, measured: Likelihood) -> None:
+        left = 1.0
         while True:
-            residuals = self._residuals(ranges, landmarks)
-            left -= self._likelihood.reweigh_partly(
-                self._weights, residuals, sigmas, left, _SHARE_LEAVES * self._count
-            )
+            least = self._resample_below * len(self._weights)
+            left -= self._likelihood.temper(self._weights, misfits, left, least)
             if left <= 0.0:
                 return
-            self._resample(self._count)
+            self._resample()
+            misfits = measured(self._particles)
 
-    def _resample(self, count: int) -> None:
-        """Go on with so many particles of equal weight."""
-        mean, factor, gain = self._cloud.pose_law(self._particles, self._weights)
-        self._particles = self._particles[self._indices(self._weights, count, self._rng)]
-        self._count = count
+    def _resample(self) -> None:
+        count = len(self._weights)
+        kept = self._indices(self._weights, count, self._rng)
+        width = self._bandwidth * _best_width(count)
+        self._particles = self._cloud.resampled(self._particles, self._weights, kept, self._noise(), width)
         self._weights = np.full(count, 1.0 / count)
-        if self._bandwidth > 0.0:
-            deviations = self._particles[:, POSE] - mean
-            deviations[:, 2] = wrap_angles(deviations[:, 2])
-            width = self._bandwidth * _best_width(count)
-            shift = width * self._noise_beside(POSE) @ factor.T
-            self._cloud.put(self._particles, mean + sqrt(1.0 - width**2) * deviations + shift, gain)
 
 
 def _best_width(count: int) -> float:

@@ -25,14 +25,17 @@ def weighted_product(a: FloatArray, b: FloatArray, weights: FloatArray) -> float
 
 @inlined
 def cholesky(matrix: FloatArray) -> FloatArray:
-    """Lower triangular root of a positive definite matrix."""
+    """Lower triangular root of a matrix that is positive definite, but for rounding."""
     root = np.zeros_like(matrix)
     for i in range(len(matrix)):
         for j in range(i + 1):
             rest = matrix[i, j]
             for k in range(j):
                 rest -= root[i, k] * root[j, k]
-            root[i, j] = sqrt(rest) if i == j else rest / root[j, j]
+            if i == j:
+                root[i, i] = sqrt(max(rest, 1e-14 * matrix[i, i]))
+            else:
+                root[i, j] = rest / root[j, j]
     return root
 
 

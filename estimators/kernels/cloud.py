@@ -1,12 +1,12 @@
-"""The cloud of particles: its motion, its noise and its moments."""
+"""The cloud of particles: its noise, its moments, and how its particles are moved and resampled."""
 
-from math import cos, sin, sqrt
+from math import sqrt
 
 import numpy as np
 
 from estimators.kernels.algebra import cholesky, solve_lower, solve_upper, weighted_product, wrapped
 from estimators.kernels.compilation import MATRIX, VECTOR, compiled
-from estimators.messages import FloatArray
+from estimators.messages import FloatArray, IntArray
 
 LEAST_VARIANCE = 1e-12
 """Of a cloud that is a single point [m^2, rad^2], so that its covariance can be inverted."""
@@ -14,32 +14,30 @@ _YAWS = (2, 8, 11)
 """Columns that are angles."""
 
 
-@compiled(f"void({MATRIX}, {MATRIX}, {VECTOR}, int64, int64)")
-def match(noise: FloatArray, particles: FloatArray, weights: FloatArray, first: int, last: int) -> None:
+@compiled(f"void({MATRIX}, {MATRIX}, {VECTOR}, int64)")
+def match(noise: FloatArray, particles: FloatArray, weights: FloatArray, first: int) -> None:
     """Give noise exactly the moments that it has on average, in place.
 
-    Its weighted mean becomes zero, its covariance the identity, its covariance with columns of the particles
-    zero. Few particles would otherwise take the chance correlations of their noise for true ones. Where there
-    are too few for that many columns, noise stays as it is.
+    Its weighted mean becomes zero, its covariance the identity, its covariance with a pose of the particles
+    zero. Few particles would otherwise take the chance correlations of their noise for true ones. Where too
+    few particles have any weight, noise stays as it is.
 
     Args:
         noise: (N, 3) standard normal.
         particles: (N, 12).
         weights: (N,) that sum to one.
-        first: first column.
-        last: the column after the last.
+        first: column where the pose begins.
 
     Source: Pham, Monthly Weather Review 129, 2001, second-order exact sampling; by Gram-Schmidt here.
     """
-    count, columns = len(noise), 1 + last - first
-    basis = np.ones((columns + 3, count))
+    count = len(noise)
+    basis = np.ones((7, count))
     for i in range(count):
-        for j in range(first, last):
-            deviation = particles[i, j] - particles[0, j]
-            basis[1 + j - first, i] = wrapped(deviation) if j in _YAWS else deviation
         for j in range(3):
-            basis[columns + j, i] = noise[i, j]
-    for k in range(columns + 3):
+            deviation = particles[i, first + j] - particles[0, first + j]
+            basis[1 + j, i] = wrapped(deviation) if j == 2 else deviation
+            basis[4 + j, i] = noise[i, j]
+    for k in range(7):
         row = basis[k]
         before = weighted_product(row, row, weights)
         for j in range(k):
@@ -47,80 +45,13 @@ def match(noise: FloatArray, particles: FloatArray, weights: FloatArray, first: 
         square = weighted_product(row, row, weights)
         if square > 1e-6 * before:
             row /= sqrt(square)
-        elif k < columns:
+        elif k < 4:
             row[:] = 0.0
         else:
             return
     for i in range(count):
         for j in range(3):
-            noise[i, j] = basis[columns + j, i]
-
-
-@compiled(f"void({MATRIX}, {MATRIX}, float64, float64, float64)")
-def move(
-    particles: FloatArray, noise: FloatArray, dt: float, accel_noise: float, yaw_accel_noise: float
-) -> None:
-    """Move particles by their velocities and a random acceleration that is constant for the step, in place.
-
-    Args:
-        particles: (N, 12).
-        noise: (N, 3) standard normal.
-        dt: time step [s].
-        accel_noise: density of the white acceleration [m/s^2/sqrt(Hz)].
-        yaw_accel_noise: density of the white angular acceleration [rad/s^2/sqrt(Hz)].
-
-    Source: Bar-Shalom et al., Estimation with Applications to Tracking and Navigation, 6.3.2.
-    """
-    for i in range(len(particles)):
-        particle = particles[i]
-        for j in range(3):
-            change = (yaw_accel_noise if j == 2 else accel_noise) * sqrt(dt) * noise[i, j]
-            particle[j] += (particle[3 + j] + 0.5 * change) * dt
-            particle[3 + j] += change
-        particle[2] = wrapped(particle[2])
-
-
-@compiled(f"{MATRIX}({MATRIX}, {VECTOR})")
-def increment_residuals(particles: FloatArray, increment: FloatArray) -> FloatArray:
-    """Measured minus predicted increment of every particle, (N, 3).
-
-    Args:
-        particles: (N, 12).
-        increment: (3,) since the keyframe, in the keyframe's body frame.
-    """
-    out = np.empty((len(particles), 3))
-    for i in range(len(particles)):
-        particle = particles[i]
-        c, s = cos(particle[8]), sin(particle[8])
-        dx, dy = particle[0] - particle[6], particle[1] - particle[7]
-        out[i, 0] = increment[0] - c * dx - s * dy
-        out[i, 1] = increment[1] + s * dx - c * dy
-        out[i, 2] = wrapped(increment[2] - particle[2] + particle[8])
-    return out
-
-
-@compiled(f"void({MATRIX}, {MATRIX}, float64)")
-def follow(particles: FloatArray, increments: FloatArray, dt: float) -> None:
-    """Put every particle where its own increment leads from its keyframe, in place.
-
-    Its velocity becomes that since the last increment.
-
-    Args:
-        particles: (N, 12).
-        increments: (N, 3) in the keyframe's body frame.
-        dt: time since the last increment [s]; at 0 velocities are kept.
-    """
-    for i in range(len(particles)):
-        particle, step = particles[i], increments[i]
-        c, s = cos(particle[8]), sin(particle[8])
-        particle[0] = particle[6] + c * step[0] - s * step[1]
-        particle[1] = particle[7] + s * step[0] + c * step[1]
-        particle[2] = wrapped(particle[8] + step[2])
-        if dt > 0.0:
-            particle[3] = (particle[0] - particle[9]) / dt
-            particle[4] = (particle[1] - particle[10]) / dt
-            particle[5] = wrapped(particle[2] - particle[11]) / dt
-        particle[9:12] = particle[0:3]
+            noise[i, j] = basis[4 + j, i]
 
 
 @compiled(f"Tuple(({VECTOR}, {MATRIX}))({MATRIX}, {VECTOR}, int64)")
@@ -196,3 +127,40 @@ def put(particles: FloatArray, poses: FloatArray, gain: FloatArray) -> None:
         particle[1] = poses[i, 1]
         for j in _YAWS:
             particle[j] = wrapped(poses[i, 2] if j == 2 else particle[j])
+
+
+@compiled(f"{MATRIX}({MATRIX}, {VECTOR}, int64[::1], {MATRIX}, float64)")
+def resampled(
+    particles: FloatArray, weights: FloatArray, kept: IntArray, noise: FloatArray, width: float
+) -> FloatArray:
+    """Particles to go on with at equal weights, spread by a Gaussian kernel.
+
+    They are drawn together first, so that the cloud keeps its mean and covariance.
+
+    Args:
+        particles: (N, 12).
+        weights: (N,) that sum to one.
+        kept: (N,) indices of those that are kept.
+        noise: (N, 3) standard normal.
+        width: of the kernel, in standard deviations of the cloud, at most 1.
+
+    Returns:
+        (N, 12).
+
+    Source: Liu and West, in Sequential Monte Carlo Methods in Practice, 2001, 10.3.
+    """
+    mean, factor, gain = pose_law(particles, weights)
+    chosen = particles[kept]
+    match(noise, chosen, np.full(len(kept), 1.0 / len(kept)), 0)
+    together = sqrt(1.0 - width * width)
+    poses = np.empty((len(kept), 3))
+    for i in range(len(kept)):
+        for j in range(3):
+            deviation = chosen[i, j] - mean[j]
+            if j == 2:
+                deviation = wrapped(deviation)
+            poses[i, j] = mean[j] + together * deviation
+            for k in range(j + 1):
+                poses[i, j] += width * factor[j, k] * noise[i, k]
+    put(chosen, poses, gain)
+    return chosen

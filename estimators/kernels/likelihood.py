@@ -57,24 +57,14 @@ def residuals(poses: FloatArray, arm: FloatArray, ranges: FloatArray, landmarks:
     return out
 
 
-@compiled(f"Tuple(({VECTOR}, {VECTOR}))({MATRIX}, {VECTOR}, {VECTOR}, float64, boolean[::1])")
-def innovations(
+@inlined
+def _innovations(
     residuals: FloatArray, weights: FloatArray, sigmas: FloatArray, gate: float, doubted: BoolArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Innovation and NIS of measurements, each after those before it that pass the gate.
+    """Innovation and NIS (K,) of measurements, each after those before it that pass the gate.
 
     The cloud's residuals are taken for Gaussian: an accepted one corrects the expectation of the others by
     their covariance, as a Kalman filter's sequential update would.
-
-    Args:
-        residuals: (N, K) measured minus predicted.
-        weights: (N,) that sum to one.
-        sigmas: (K,) standard deviations of the measurements.
-        gate: greatest NIS that passes.
-        doubted: (K,) True where a measurement does not count whatever its NIS.
-
-    Returns:
-        Innovations (K,) and NIS (K,).
     """
     count = residuals.shape[1]
     mean, cov = np.zeros(count), np.zeros((count, count))
@@ -84,7 +74,7 @@ def innovations(
     for i in range(len(residuals)):
         for j in range(count):
             deviation = weights[i] * (residuals[i, j] - mean[j])
-            for k in range(count):
+            for k in range(j + 1):
                 cov[j, k] += deviation * (residuals[i, k] - mean[k])
     nis = np.empty(count)
     for j in range(count):
@@ -94,13 +84,24 @@ def innovations(
             for k in range(j + 1, count):
                 gain = cov[k, j] / cov[j, j]
                 mean[k] -= gain * mean[j]
-                for m in range(j + 1, count):
-                    cov[k, m] -= gain * cov[j, m]
+                for m in range(j + 1, k + 1):
+                    cov[k, m] -= gain * cov[m, j]
     return mean, nis
 
 
 @inlined
-def misfits(residuals: FloatArray, sigmas: FloatArray) -> FloatArray:
+def _sigmas(ranges: FloatArray, landmarks: FloatArray) -> FloatArray:
+    """Standard deviations of measurements in the order of their residuals."""
+    out = np.empty(len(ranges) + 2 * len(landmarks))
+    out[: len(ranges)] = ranges[:, 3]
+    for j in range(len(landmarks)):
+        out[len(ranges) + 2 * j] = landmarks[j, 4]
+        out[len(ranges) + 2 * j + 1] = landmarks[j, 5]
+    return out
+
+
+@inlined
+def _half_squares(residuals: FloatArray, sigmas: FloatArray) -> FloatArray:
     """Half the sum of squares (N,) of residuals (N, K) in units of their sigmas (K,)."""
     out = np.empty(len(residuals))
     for i in range(len(residuals)):
@@ -110,6 +111,63 @@ def misfits(residuals: FloatArray, sigmas: FloatArray) -> FloatArray:
             square += scaled * scaled
         out[i] = 0.5 * square
     return out
+
+
+@compiled(f"{VECTOR}({MATRIX}, {VECTOR}, {MATRIX}, {MATRIX})")
+def misfits(particles: FloatArray, arm: FloatArray, ranges: FloatArray, landmarks: FloatArray) -> FloatArray:
+    """Negative logarithm of the likelihood of independent Gaussian errors, but for a constant.
+
+    Args:
+        particles: (N, 3 or more) pose in the first columns, map frame.
+        arm: (3,) tag antenna in the body frame [m].
+        ranges: (M, 4); one of infinite sigma does not count.
+        landmarks: (L, 6), likewise.
+
+    Returns:
+        (N,).
+
+    Source: huang2024 Eq. (26), its logarithm.
+    """
+    return _half_squares(residuals(particles, arm, ranges, landmarks), _sigmas(ranges, landmarks))
+
+
+@compiled(
+    f"Tuple(({VECTOR}, {VECTOR}, {VECTOR}))"
+    f"({MATRIX}, {VECTOR}, {VECTOR}, {MATRIX}, {MATRIX}, float64, boolean[::1])"
+)
+def gated_misfits(
+    particles: FloatArray,
+    weights: FloatArray,
+    arm: FloatArray,
+    ranges: FloatArray,
+    landmarks: FloatArray,
+    gate: float,
+    doubted: BoolArray,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """As `misfits`, of the measurements that pass their gate; the sigmas of the others become infinite.
+
+    Args:
+        particles: (N, 12).
+        weights: (N,) that sum to one.
+        arm: (3,) tag antenna in the body frame [m].
+        ranges: (M, 4); sigmas are changed in place.
+        landmarks: (L, 6), likewise; range and bearing of a landmark pass together or not at all.
+        gate: greatest NIS that passes.
+        doubted: (M + 2 L,) True where a measurement does not count whatever its NIS.
+
+    Returns:
+        Innovations and NIS, both (M + 2 L,), each after the measurements before it; misfits (N,).
+    """
+    values = residuals(particles, arm, ranges, landmarks)
+    innovations, nis = _innovations(values, weights, _sigmas(ranges, landmarks), gate, doubted)
+    for j in range(len(ranges)):
+        if doubted[j] or not nis[j] <= gate:
+            ranges[j, 3] = np.inf
+    for j in range(len(landmarks)):
+        k = len(ranges) + 2 * j
+        if not (nis[k] <= gate and nis[k + 1] <= gate):
+            landmarks[j, 4] = landmarks[j, 5] = np.inf
+    return innovations, nis, _half_squares(values, _sigmas(ranges, landmarks))
 
 
 @inlined
@@ -126,51 +184,32 @@ def normalised(logarithms: FloatArray, weights: FloatArray) -> float:
     return total * total / total_square
 
 
-@compiled(f"float64({VECTOR}, {MATRIX}, {VECTOR})")
-def reweigh(weights: FloatArray, residuals: FloatArray, sigmas: FloatArray) -> float:
-    """Multiply weights by the likelihood of independent Gaussian errors and normalise them, in place.
+@compiled(f"float64({VECTOR}, {VECTOR}, float64, float64)")
+def temper(weights: FloatArray, misfits: FloatArray, most: float, effective: float) -> float:
+    """Multiply weights by the greatest power of a likelihood that leaves enough of them, in place.
 
     Args:
-        weights: (N,).
-        residuals: (N, K) measured minus predicted.
-        sigmas: (K,) standard deviations of the measurements; an infinite one does not count.
-
-    Returns:
-        Effective sample size.
-
-    Source: huang2024 Eq. (26) and (28).
-    """
-    return normalised(np.log(weights) - misfits(residuals, sigmas), weights)
-
-
-@compiled(f"float64({VECTOR}, {MATRIX}, {VECTOR}, float64, float64)")
-def reweigh_partly(
-    weights: FloatArray, residuals: FloatArray, sigmas: FloatArray, most: float, effective: float
-) -> float:
-    """As `reweigh`, with the likelihood raised to the greatest power that leaves enough effective particles.
-
-    Args:
-        weights: (N,).
-        residuals: (N, K) measured minus predicted.
-        sigmas: (K,) standard deviations of the measurements; an infinite one does not count.
+        weights: (N,) that sum to one, before and after.
+        misfits: (N,) negative logarithm of the likelihood.
         most: greatest power that is asked for.
         effective: sample size that shall be left.
 
     Returns:
-        The power: `most`, or less, though never less than 0.005.
+        The power: `most`, or less, though never less than 0.01.
 
-    Source: Musso, Oudjane and Le Gland, in Sequential Monte Carlo Methods in Practice, 2001, 12.4.
+    Source: weights huang2024 Eq. (28); power: Musso, Oudjane and Le Gland, in Sequential Monte Carlo Methods
+    in Practice, 2001, 12.4.
     """
-    logarithms, misfit = np.log(weights), misfits(residuals, sigmas)
-    if normalised(logarithms - most * misfit, weights) >= effective:
+    logarithms = np.log(weights)
+    if normalised(logarithms - most * misfits, weights) >= effective:
         return most
     low, high = 0.0, most
     for _ in range(10):
         power = 0.5 * (low + high)
-        if normalised(logarithms - power * misfit, weights) >= effective:
+        if normalised(logarithms - power * misfits, weights) >= effective:
             low = power
         else:
             high = power
-    power = min(most, max(low, 0.005))
-    normalised(logarithms - power * misfit, weights)
+    power = min(most, max(low, 0.01))
+    normalised(logarithms - power * misfits, weights)
     return power

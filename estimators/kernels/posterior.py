@@ -11,9 +11,10 @@ from typing import TypeAlias
 import numpy as np
 
 from estimators.kernels.algebra import cholesky, solve_lower, solve_upper, wrapped
+from estimators.kernels.cloud import match, pose_law, put
 from estimators.kernels.compilation import MATRIX, VECTOR, compiled, inlined
 from estimators.kernels.likelihood import landmark_residuals, normalised, range_residual, residuals
-from estimators.messages import FloatArray
+from estimators.messages import FloatArray, IntArray
 
 Posterior: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]
 
@@ -22,6 +23,10 @@ _PULL = 2.0
 """c1 and c2 of Eq. (21), as in `estimators.beetle_antennae`, like the three below."""
 _FIRST_INERTIA, _LAST_INERTIA = 1.0, 0.3
 _DISTURBANCE = 0.03
+MAX_HEADING_SIGMA = 0.35
+"""With a less certain heading [rad] a cloud is a ring, not a Gaussian."""
+WIDER = 1.1
+"""Standard deviations of the Gaussian drawn from, over those of the posterior: weights stay bounded so."""
 _NUDGE = 1e-3
 """Step of the numerical derivative, in units of u."""
 
@@ -152,25 +157,16 @@ def gauss_newton(u: FloatArray, posterior: Posterior) -> tuple[FloatArray, Float
     return (stepped if cost(stepped, posterior) < cost(u, posterior) else u), root
 
 
-@compiled(
-    f"Tuple(({MATRIX}, {VECTOR}, float64))({VECTOR}, {MATRIX}, {MATRIX}, {VECTOR}, float64, {_POSTERIOR})"
-)
+@compiled(f"Tuple(({MATRIX}, {VECTOR}, float64))({VECTOR}, {MATRIX}, {MATRIX}, {_POSTERIOR})")
 def draw(
-    mode: FloatArray,
-    root: FloatArray,
-    normal: FloatArray,
-    stretch: FloatArray,
-    freedom: float,
-    posterior: Posterior,
+    mode: FloatArray, root: FloatArray, normal: FloatArray, posterior: Posterior
 ) -> tuple[FloatArray, FloatArray, float]:
-    """Particles of a multivariate t distribution around the mode, weighted to be samples of the posterior.
+    """Poses drawn from a Gaussian around the mode, weighted to be samples of the posterior.
 
     Args:
         mode: (3,) u.
         root: (3, 3) lower Cholesky factor of the information matrix there.
         normal: (N, 3) standard normal numbers.
-        stretch: (N,) roots of `freedom` over chi-square numbers of that many degrees of freedom.
-        freedom: degrees of freedom of the distribution.
         posterior: the target.
 
     Returns:
@@ -179,11 +175,52 @@ def draw(
     mean, factor = posterior[:2]
     poses, logarithms = np.empty((len(normal), 3)), np.empty(len(normal))
     for i in range(len(normal)):
-        offset = normal[i] * stretch[i]
-        u = mode + solve_upper(root, offset)
-        square = offset[0] ** 2 + offset[1] ** 2 + offset[2] ** 2
-        logarithms[i] = 0.5 * (freedom + 3.0) * log(1.0 + square / freedom) - cost(u, posterior)
+        u = mode + WIDER * solve_upper(root, normal[i])
+        square = normal[i, 0] ** 2 + normal[i, 1] ** 2 + normal[i, 2] ** 2
+        logarithms[i] = 0.5 * square - cost(u, posterior)
         poses[i] = _pose(u, mean, factor)
     weights = np.empty(len(normal))
     effective = normalised(logarithms, weights)
     return poses, weights, effective
+
+
+@compiled(
+    f"Tuple(({MATRIX}, {VECTOR}, float64))"
+    f"({MATRIX}, {VECTOR}, int64[::1], {VECTOR}, {MATRIX}, {MATRIX}, {MATRIX}, {MATRIX})"
+)
+def sample(
+    particles: FloatArray,
+    weights: FloatArray,
+    kept: IntArray,
+    arm: FloatArray,
+    ranges: FloatArray,
+    landmarks: FloatArray,
+    uniform: FloatArray,
+    normal: FloatArray,
+) -> tuple[FloatArray, FloatArray, float]:
+    """Particles of the posterior of a cloud and measurements: search, Gauss-Newton step, and draw.
+
+    Args:
+        particles: (N, 12) of the cloud.
+        weights: (N,) that sum to one, before the measurements.
+        kept: (N,) indices of the particles that new ones take velocity and keyframe from.
+        arm: (3,) tag antenna in the body frame [m].
+        ranges: (M, 4).
+        landmarks: (L, 6).
+        uniform: (K, 6 N + 3) random numbers of [0, 1) for K moves of the beetles.
+        normal: (N, 3) standard normal numbers; are given the moments that they should have.
+
+    Returns:
+        Particles (N, 12); weights (N,) that sum to one; effective sample size, which is 0 when the cloud's
+        heading is too uncertain for it to count as Gaussian.
+    """
+    mean, factor, gain = pose_law(particles, weights)
+    chosen = particles[kept]
+    if factor[2, 0] ** 2 + factor[2, 1] ** 2 + factor[2, 2] ** 2 > MAX_HEADING_SIGMA**2:
+        return chosen, weights, 0.0
+    posterior = (mean, factor, arm, ranges, landmarks)
+    mode, root = gauss_newton(search(particles, uniform, posterior), posterior)
+    match(normal, chosen, np.full(len(kept), 1.0 / len(kept)), 0)
+    poses, new_weights, effective = draw(mode, root, normal, posterior)
+    put(chosen, poses, gain)
+    return chosen, new_weights, effective
