@@ -98,14 +98,21 @@ def pose_law(particles: FloatArray, weights: FloatArray) -> tuple[FloatArray, Fl
         Mean (3,), lower Cholesky factor (3, 3) of the covariance, regression (9, 3) of the other columns.
     """
     mean, cov = moments(particles, weights, 12)
-    pose_cov = cov[:3, :3].copy()
+    pose, pose_cov = np.empty(3), np.empty((3, 3))
     for j in range(3):
-        pose_cov[j, j] += 1e-9 * pose_cov[j, j] + LEAST_VARIANCE
+        pose[j] = mean[j]
+        for k in range(3):
+            pose_cov[j, k] = cov[j, k]
+        pose_cov[j, j] += 1e-9 * cov[j, j] + LEAST_VARIANCE
     factor = cholesky(pose_cov)
-    gain = np.empty((9, 3))
+    gain, along = np.empty((9, 3)), np.empty(3)
     for j in range(9):
-        gain[j] = solve_upper(factor, solve_lower(factor, cov[3 + j, :3]))
-    return mean[:3].copy(), factor, gain
+        for k in range(3):
+            along[k] = cov[3 + j, k]
+        along = solve_upper(factor, solve_lower(factor, along))
+        for k in range(3):
+            gain[j, k] = along[k]
+    return pose, factor, gain
 
 
 @compiled(f"void({MATRIX}, {MATRIX}, {MATRIX})")

@@ -93,7 +93,8 @@ def _innovations(
 def _sigmas(ranges: FloatArray, landmarks: FloatArray) -> FloatArray:
     """Standard deviations of measurements in the order of their residuals."""
     out = np.empty(len(ranges) + 2 * len(landmarks))
-    out[: len(ranges)] = ranges[:, 3]
+    for j in range(len(ranges)):
+        out[j] = ranges[j, 3]
     for j in range(len(landmarks)):
         out[len(ranges) + 2 * j] = landmarks[j, 4]
         out[len(ranges) + 2 * j + 1] = landmarks[j, 5]

@@ -76,25 +76,29 @@ def search(particles: FloatArray, uniform: FloatArray, posterior: Posterior) -> 
     """
     mean, factor = posterior[:2]
     count = len(particles)
-    starts, costs = np.empty((count, 3)), np.empty(count)
+    beetles, own, velocity = np.empty((count, 3)), np.empty((count, 3)), np.zeros((count, 3))
+    costs = np.empty(count)
+    right, left, centre = np.empty(3), np.empty(3), np.empty(3)
     for i in range(count):
-        deviation = particles[i, :3] - mean
-        deviation[2] = wrapped(deviation[2])
-        starts[i] = solve_lower(factor, deviation)
-        costs[i] = cost(starts[i], posterior)
+        for j in range(3):
+            right[j] = particles[i, j] - mean[j]
+        right[2] = wrapped(right[2])
+        start = solve_lower(factor, right)
+        costs[i] = cost(start, posterior)
+        for j in range(3):
+            beetles[i, j] = own[i, j] = start[j]
     half = (count + 1) // 2
-    pull = log(half + 0.5) - np.log(np.arange(1, half + 1))
-    pull /= pull.sum()
-    beetles, own = starts.copy(), starts.copy()
-    velocity = np.zeros_like(starts)
-    right, left = np.empty(3), np.empty(3)
+    pull = np.empty(half)
+    for i in range(half):
+        pull[i] = log(half + 0.5) - log(i + 1.0)
+    total = pull.sum()
     for k in range(len(uniform)):
         inertia = _FIRST_INERTIA - (_FIRST_INERTIA - _LAST_INERTIA) * k / len(uniform)  # (18)
-        centre = np.zeros(3)
         order = np.argsort(costs)
-        for i in range(half):
-            for j in range(3):
-                centre[j] += pull[i] * own[order[i], j]
+        for j in range(3):
+            centre[j] = 0.0
+            for i in range(half):
+                centre[j] += pull[i] / total * own[order[i], j]
         for i in range(count):
             for j in range(3):
                 place = beetles[i, j]
@@ -112,17 +116,25 @@ def search(particles: FloatArray, uniform: FloatArray, posterior: Posterior) -> 
                 beetles[i, j] = moved[j]
             if min(right_cost, left_cost) < costs[i]:
                 costs[i] = min(right_cost, left_cost)
-                own[i] = moved
+                for j in range(3):
+                    own[i, j] = moved[j]
         best = costs.argmin()
         for j in range(3):  # (25)
-            spread = np.abs(beetles[:, j] - beetles[:, j].mean()).mean()
+            middle, spread = 0.0, 0.0
+            for i in range(count):
+                middle += beetles[i, j] / count
+            for i in range(count):
+                spread += abs(beetles[i, j] - middle) / count
             right[j] = own[best, j] + _DISTURBANCE * spread * tan(pi * (uniform[k, 6 * count + j] - 0.5))
         disturbed_cost = cost(right, posterior)
         if disturbed_cost < costs[best]:
             costs[best] = disturbed_cost
-            own[best] = right
-    found: FloatArray = own[costs.argmin()].copy()
-    return found
+            for j in range(3):
+                own[best, j] = right[j]
+    best = costs.argmin()
+    for j in range(3):
+        right[j] = own[best, j]
+    return right
 
 
 @compiled(f"Tuple(({VECTOR}, {MATRIX}))({VECTOR}, {_POSTERIOR})")
