@@ -38,7 +38,9 @@ class SiteTable(Table):
         0.0, ge=-360, le=360, description="compass heading of the map's +x axis, clockwise from north [deg]"
     )
     walls: list[list[tuple[Coordinate, Coordinate]]] = Field(
-        [], description="polylines of walls, drawn in views only [m]"
+        [],
+        description="polylines of walls, for views and for particle filters with scan_likelihood, which hold "
+        "scans against them [m]",
     )
 
 
@@ -184,8 +186,13 @@ class Config(Table):
 
     @field_validator("estimator")
     @classmethod
-    def _estimator_settings(cls, settings: Any) -> Any:
-        return _estimator_tables().model_validate(settings)
+    def _estimator_settings(cls, settings: Any, info: Any) -> Any:
+        tables = _estimator_tables().model_validate(settings)
+        has_walls = "site" in info.data and any(len(wall) > 1 for wall in info.data["site"].walls)
+        for name in ESTIMATORS:
+            if getattr(getattr(tables, name), "scan_likelihood", False) and not has_walls:
+                raise ValueError(f"{name}.scan_likelihood needs a wall in site.walls")
+        return tables
 
     def estimator_config(self, name: str) -> BaseModel:
         """Settings of the named estimator."""
@@ -208,6 +215,8 @@ class Config(Table):
             height=body.height,
             height_sigma=body.height_sigma,
             level_sigma=float(np.deg2rad(body.level_sigma_deg)),
+            walls=[np.array(wall) for wall in self.site.walls],
+            lidar_in_body=self.lidar_mounting(),
         )
 
     def lidar_mounting(self) -> FloatArray:

@@ -76,6 +76,8 @@ class Setup:
         height_sigma: standard deviation of `height` [m].
         level_sigma: standard deviation of roll and pitch [rad] of a robot that walks level.
         landmarks: landmark id -> position (2,) [m], map frame; those that are known beforehand.
+        walls: polylines (N, 2) [m], map frame.
+        lidar_in_body: (3,) x [m], y [m], yaw [rad] of the LiDAR in the body frame.
     """
 
     anchors: dict[int, FloatArray]
@@ -85,6 +87,8 @@ class Setup:
     height_sigma: float
     level_sigma: float
     landmarks: dict[int, FloatArray] = field(default_factory=dict)
+    walls: list[FloatArray] = field(default_factory=list)
+    lidar_in_body: FloatArray = field(default_factory=lambda: np.zeros(3))
 
     def height_to(self, anchor: FloatArray) -> float:
         """Height of an anchor above the tag [m]."""

@@ -72,10 +72,10 @@ class ParticleCloud(KeyframeTracker):
 
     def __init__(self, config: Config, setup: Setup) -> None:
         # Numba loads slowly: only who makes a filter waits for it.
-        from estimators.kernels import cloud, likelihood, motion
+        from estimators.kernels import cloud, likelihood, motion, scan
 
         super().__init__(config, setup)
-        self._cloud, self._likelihood, self._motion = cloud, likelihood, motion
+        self._cloud, self._likelihood, self._motion, self._scan = cloud, likelihood, motion, scan
         self._count = config.particles
         self._seed = config.seed
         self._gate = RangeGate(config, setup)
@@ -95,7 +95,7 @@ class ParticleCloud(KeyframeTracker):
         return self._particles.copy(), self._weights.copy()
 
     def update(self, measurement: Measurement) -> Report:
-        """Predict to the measurement's time and take it; scans and inertial sensors are not used."""
+        """Predict to the measurement's time and take it; ranges, landmarks and increments are used."""
         if isinstance(measurement, RangeFrame):
             if self._is_late(measurement.stamp_ns):
                 return Report((Verdict.LATE,) * len(measurement.ranges))
@@ -114,7 +114,7 @@ class ParticleCloud(KeyframeTracker):
             return None
         mean, cov = self._cloud.moments(self._particles, self._weights, 6)
         dt = 0.0 if self._stands else (stamp_ns - self._stamp_ns) * 1e-9
-        F, Q = constant_velocity(dt, *self._accel_noise)
+        F, Q = constant_velocity(dt, *self._noise_densities())
         planar = (F @ cov @ F.T + Q)[POSE, POSE]
         cov = self._setup.lift_covariance(0.5 * (planar + planar.T) + self._cloud.LEAST_VARIANCE * np.eye(3))
         return PoseEstimate(stamp_ns, lift((F @ mean)[POSE], self._setup.height), cov, self._reset_counter)
@@ -149,19 +149,28 @@ class ParticleCloud(KeyframeTracker):
 
     def _move(self, dt: float) -> None:
         if dt > 0.0:
-            self._motion.move(self._particles, self._weights, self._noise(), dt, *self._accel_noise)
+            self._motion.move(self._particles, self._weights, self._noise(), dt, *self._noise_densities())
 
     def _follow(self, measured: PoseIncrement) -> Report:
-        value, cov = measured.increment, measured.cov
-        nis = self._motion.increment_nis(self._particles, self._weights, value, cov)
+        nis = self._motion.increment_nis(self._particles, self._weights, measured.increment, measured.cov)
         report = np.full(1, np.nan), np.array([nis])
         if nis > self._increment_gate:
             return Report((Verdict.GATED,), *report)
+        self._take_increment(measured)
+        return Report((Verdict.ACCEPTED,), *report)
+
+    def _take_increment(self, measured: PoseIncrement) -> None:
+        """Move every particle from its keyframe by the increment."""
         assert self._stamp_ns is not None
         dt = (self._stamp_ns - self._last_ns) * 1e-9
-        self._motion.follow(self._particles, self._weights, self._noise(), value, cov, dt)
+        self._motion.follow(
+            self._particles, self._weights, self._noise(), measured.increment, measured.cov, dt
+        )
         self._last_ns = self._stamp_ns
-        return Report((Verdict.ACCEPTED,), *report)
+
+    def _noise_densities(self) -> tuple[float, float]:
+        """Densities of white acceleration [m/s^2/sqrt(Hz)] and angular acceleration [rad/s^2/sqrt(Hz)]."""
+        return self._accel_noise
 
     def _take_reference(self) -> None:
         assert self._stamp_ns is not None

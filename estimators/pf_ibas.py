@@ -49,6 +49,12 @@ class PfIbas(ParticleFilter):
             40, ge=10, le=100_000, description="number of particles, which are the beetles"
         )
         iterations: int = Field(2, ge=0, le=1000, description="moves of each beetle in a search")
+        resample_below: float = Field(
+            0.7,
+            gt=0,
+            lt=1,
+            description="sample anew when the effective sample size would fall below this share",
+        )
 
     def __init__(self, config: Config, setup: Setup) -> None:
         from estimators.kernels import posterior

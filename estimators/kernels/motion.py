@@ -88,6 +88,23 @@ def increment_nis(
     return float(scaled[0] * scaled[0] + scaled[1] * scaled[1] + scaled[2] * scaled[2])
 
 
+@compiled(f"{VECTOR}({MATRIX}, {VECTOR}, {MATRIX})")
+def increment_misfits(particles: FloatArray, increment: FloatArray, cov: FloatArray) -> FloatArray:
+    """Negative logarithm (N,) of how likely particles make an increment, but for a constant.
+
+    Args:
+        particles: (N, 12).
+        increment: (3,) since the keyframe, in the keyframe's body frame.
+        cov: (3, 3) of the increment.
+    """
+    residuals, root = increment_residuals(particles, increment), cholesky(cov)
+    out = np.empty(len(particles))
+    for i in range(len(particles)):
+        scaled = solve_lower(root, residuals[i])
+        out[i] = 0.5 * (scaled[0] * scaled[0] + scaled[1] * scaled[1] + scaled[2] * scaled[2])
+    return out
+
+
 @compiled(f"void({MATRIX}, {VECTOR}, {MATRIX}, {VECTOR}, {MATRIX}, float64)")
 def follow(
     particles: FloatArray,
