@@ -1,9 +1,9 @@
 """Particles that follow odometry increments and are held against UWB ranges and known landmarks.
 
-A particle is a row of 12 numbers: pose (x, y, yaw) and velocity (vx, vy, yaw rate) in the map, the pose at
-which the odometry's current keyframe was taken, and the pose at the last increment. An increment puts it
-where ``keyframe pose (+) (increment + noise)`` is, with noise drawn anew from the increment's covariance;
-what ranges said of the keyframe's pose stays in the weights. In between, it moves with constant velocity.
+A particle is a row of 9 numbers: pose (x, y, yaw) and velocity (vx, vy, yaw rate) in the map, and the pose at
+which the odometry's current keyframe was taken. It moves with constant velocity and white acceleration; an
+increment corrects how it moved since the keyframe (`kernels.motion.take_increment`), by which no particle
+gains on another. Ranges, landmarks and scans do weigh the particles.
 """
 
 from abc import abstractmethod
@@ -30,12 +30,12 @@ from estimators.messages import (
 from estimators.models.motion import constant_velocity
 from estimators.range_gate import RangeGate
 
-POSE, VELOCITY, KEYFRAME, LAST = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
+POSE, VELOCITY, KEYFRAME = slice(0, 3), slice(3, 6), slice(6, 9)
 _NO_RANGES, _NO_LANDMARKS = np.empty((0, 4)), np.empty((0, 6))
 
 
 Likelihood: TypeAlias = Callable[[FloatArray], FloatArray]
-"""Particles (N, 12) -> negative logarithm (N,) of how likely they make a measurement."""
+"""Particles (N, 9) -> negative logarithm (N,) of how likely they make a measurement."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -91,7 +91,7 @@ class ParticleCloud(KeyframeTracker):
 
     @property
     def particles(self) -> tuple[FloatArray, FloatArray]:
-        """Particles (N, 12) and weights (N,) at the newest measurement, for tests and pictures."""
+        """Particles (N, 9) and weights (N,) at the newest measurement, for tests and pictures."""
         return self._particles.copy(), self._weights.copy()
 
     def update(self, measurement: Measurement) -> Report:
@@ -130,18 +130,17 @@ class ParticleCloud(KeyframeTracker):
 
     def _place(self, pose: FloatArray, cov: FloatArray) -> None:
         self._gate.reset()
-        self._particles = np.zeros((self._count, 12))
+        self._particles = np.zeros((self._count, 9))
         self._weights = np.full(self._count, 1.0 / self._count)
         self._particles[:, POSE] = pose + self._matched_noise() @ _root(cov).T
-        self._particles[:, KEYFRAME] = self._particles[:, LAST] = self._particles[:, POSE]
-        self._last_ns = self._stamp_ns or 0
+        self._particles[:, KEYFRAME] = self._particles[:, POSE]
 
     def _noise(self) -> FloatArray:
         return self._rng.standard_normal((self._count, 3))
 
     def _matched_noise(self) -> FloatArray:
         noise = self._noise()
-        self._cloud.match(noise, self._particles, self._weights, POSE.start)
+        self._cloud.match(noise, self._particles, self._weights)
         return noise
 
     def _set_speed_free(self) -> None:
@@ -152,30 +151,23 @@ class ParticleCloud(KeyframeTracker):
             self._motion.move(self._particles, self._weights, self._noise(), dt, *self._noise_densities())
 
     def _follow(self, measured: PoseIncrement) -> Report:
-        nis = self._motion.increment_nis(self._particles, self._weights, measured.increment, measured.cov)
-        report = np.full(1, np.nan), np.array([nis])
-        if nis > self._increment_gate:
-            return Report((Verdict.GATED,), *report)
-        self._take_increment(measured)
-        return Report((Verdict.ACCEPTED,), *report)
-
-    def _take_increment(self, measured: PoseIncrement) -> None:
-        """Move every particle from its keyframe by the increment."""
-        assert self._stamp_ns is not None
-        dt = (self._stamp_ns - self._last_ns) * 1e-9
-        self._motion.follow(
-            self._particles, self._weights, self._noise(), measured.increment, measured.cov, dt
+        nis = self._motion.take_increment(
+            self._particles,
+            self._weights,
+            self._noise(),
+            measured.increment,
+            measured.cov,
+            self._increment_gate,
         )
-        self._last_ns = self._stamp_ns
+        verdict = Verdict.ACCEPTED if nis <= self._increment_gate else Verdict.GATED
+        return Report((verdict,), np.full(1, np.nan), np.array([nis]))
+
+    def _take_reference(self) -> None:
+        self._particles[:, KEYFRAME] = self._particles[:, POSE]
 
     def _noise_densities(self) -> tuple[float, float]:
         """Densities of white acceleration [m/s^2/sqrt(Hz)] and angular acceleration [rad/s^2/sqrt(Hz)]."""
         return self._accel_noise
-
-    def _take_reference(self) -> None:
-        assert self._stamp_ns is not None
-        self._particles[:, KEYFRAME] = self._particles[:, LAST] = self._particles[:, POSE]
-        self._last_ns = self._stamp_ns
 
     def _update_ranges(self, frame: RangeFrame) -> Report:
         count = len(frame.ranges)

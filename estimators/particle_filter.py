@@ -1,6 +1,5 @@
 """Particle filter with the motion as its proposal."""
 
-from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -9,7 +8,7 @@ from pydantic import Field
 from estimators.base import Report, Setup, Verdict
 from estimators.geometry import wrap_angles
 from estimators.lidar.likelihood_field import LikelihoodField, beams_of
-from estimators.messages import FloatArray, ImuSample, Measurement, PoseIncrement, Scan
+from estimators.messages import FloatArray, ImuSample, Measurement, Scan
 from estimators.particle_cloud import Likelihood, ParticleCloud
 from estimators.resampling import RESAMPLING
 
@@ -46,8 +45,8 @@ class ParticleFilter(ParticleCloud):
         )
         motion: Literal["increments", "imu"] = Field(
             "increments",
-            description="what moves the particles: increments; or the gyroscope's yaw rate, with increments "
-            "weighing them (the tag's axes are the body's; without samples, constant velocity)",
+            description="what is expected between increments: constant velocity; or the yaw rate of the "
+            "gyroscope, where it comes (the tag's axes are the body's)",
         )
         gyro_bias: float = Field(
             0.02, gt=0, le=1, description="standard deviation of the gyroscope's bias [rad/s]"
@@ -151,13 +150,6 @@ class ParticleFilter(ParticleCloud):
         accel_noise, yaw_accel_noise = super()._noise_densities()
         assert self._stamp_ns is not None
         return accel_noise, _GYRO_DRIFT if self._has_rate(self._stamp_ns) else yaw_accel_noise
-
-    def _take_increment(self, measured: PoseIncrement) -> None:
-        if not self._uses_imu:
-            super()._take_increment(measured)
-            return
-        likelihood = partial(self._motion.increment_misfits, increment=measured.increment, cov=measured.cov)
-        self._take(likelihood(self._particles), likelihood)
 
     def _take(self, misfits: FloatArray, measured: Likelihood) -> None:
         left = 1.0

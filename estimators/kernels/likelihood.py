@@ -148,7 +148,7 @@ def gated_misfits(
     """As `misfits`, of the measurements that pass their gate; the sigmas of the others become infinite.
 
     Args:
-        particles: (N, 12).
+        particles: (N, 9).
         weights: (N,) that sum to one.
         arm: (3,) tag antenna in the body frame [m].
         ranges: (M, 4); sigmas are changed in place.

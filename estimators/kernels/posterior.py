@@ -65,7 +65,7 @@ def search(particles: FloatArray, uniform: FloatArray, posterior: Posterior) -> 
     This is `beetle_antennae.ImprovedBeetleAntennaeSearch`, place for place, in three dimensions.
 
     Args:
-        particles: (N, 12) where the beetles start.
+        particles: (N, 9) where the beetles start.
         uniform: (K, 6 N + 3) random numbers of [0, 1), as the search would draw them in K iterations.
         posterior: to be climbed.
 
@@ -213,7 +213,7 @@ def sample(
     """Particles of the posterior of a cloud and measurements: search, Gauss-Newton step, and draw.
 
     Args:
-        particles: (N, 12) of the cloud.
+        particles: (N, 9) of the cloud.
         weights: (N,) that sum to one, before the measurements.
         kept: (N,) indices of the particles that new ones take velocity and keyframe from.
         arm: (3,) tag antenna in the body frame [m].
@@ -223,7 +223,7 @@ def sample(
         normal: (N, 3) standard normal numbers; are given the moments that they should have.
 
     Returns:
-        Particles (N, 12); weights (N,) that sum to one; effective sample size, which is 0 when the cloud's
+        Particles (N, 9); weights (N,) that sum to one; effective sample size, which is 0 when the cloud's
         heading is too uncertain for it to count as Gaussian.
     """
     mean, factor, gain = pose_law(particles, weights)
@@ -232,7 +232,7 @@ def sample(
         return chosen, weights, 0.0
     posterior = (mean, factor, arm, ranges, landmarks)
     mode, root = gauss_newton(search(particles, uniform, posterior), posterior)
-    match(normal, chosen, np.full(len(kept), 1.0 / len(kept)), 0)
+    match(normal, chosen, np.full(len(kept), 1.0 / len(kept)))
     poses, new_weights, effective = draw(mode, root, normal, posterior)
     put(chosen, poses, gain)
     return chosen, new_weights, effective

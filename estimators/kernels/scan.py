@@ -37,7 +37,7 @@ def scan_misfits(
     Every beam is seen from where a particle was when it was measured, by the particle's velocity.
 
     Args:
-        particles: (N, 12).
+        particles: (N, 9).
         beams: (B, 3) direction [rad], lidar frame; range [m]; how long before the particles' time [s].
         lidar_in_body: (3,) x [m], y [m], yaw [rad] of the LiDAR, body frame.
         distances: (rows, columns) to the nearest obstacle [m], rows along y, at least 2 of each.
