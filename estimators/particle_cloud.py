@@ -114,7 +114,7 @@ class ParticleCloud(KeyframeTracker):
             return None
         mean, cov = self._cloud.moments(self._particles, self._weights, 6)
         dt = 0.0 if self._stands else (stamp_ns - self._stamp_ns) * 1e-9
-        F, Q = constant_velocity(dt, *self._noise_densities())
+        F, Q = constant_velocity(dt, *self._accel_noise)
         planar = (F @ cov @ F.T + Q)[POSE, POSE]
         cov = self._setup.lift_covariance(0.5 * (planar + planar.T) + self._cloud.LEAST_VARIANCE * np.eye(3))
         return PoseEstimate(stamp_ns, lift((F @ mean)[POSE], self._setup.height), cov, self._reset_counter)
@@ -148,7 +148,7 @@ class ParticleCloud(KeyframeTracker):
 
     def _move(self, dt: float) -> None:
         if dt > 0.0:
-            self._motion.move(self._particles, self._weights, self._noise(), dt, *self._noise_densities())
+            self._motion.move(self._particles, self._weights, self._noise(), dt, *self._accel_noise)
 
     def _follow(self, measured: PoseIncrement) -> Report:
         nis = self._motion.take_increment(
@@ -164,10 +164,6 @@ class ParticleCloud(KeyframeTracker):
 
     def _take_reference(self) -> None:
         self._particles[:, KEYFRAME] = self._particles[:, POSE]
-
-    def _noise_densities(self) -> tuple[float, float]:
-        """Densities of white acceleration [m/s^2/sqrt(Hz)] and angular acceleration [rad/s^2/sqrt(Hz)]."""
-        return self._accel_noise
 
     def _update_ranges(self, frame: RangeFrame) -> Report:
         count = len(frame.ranges)

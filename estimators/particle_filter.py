@@ -1,9 +1,11 @@
 """Particle filter with the motion as its proposal."""
 
+from math import isfinite
 from typing import Literal
 
 import numpy as np
 from pydantic import Field
+from scipy.stats import chi2
 
 from estimators.base import Report, Setup, Verdict
 from estimators.geometry import wrap_angles
@@ -16,12 +18,6 @@ _INDEPENDENT_BEAMS = 10
 """All beams of a scan count as this many: they err together, by the map and by how level the LiDAR is."""
 _STRAYS = 0.1
 """Share of beams that end on what the map does not have."""
-_MAX_RATE = 100.0
-"""No robot turns faster [rad/s]."""
-_RATE_HOLDS_NS = 200_000_000
-"""A yaw rate this old no longer says how the robot turns."""
-_GYRO_DRIFT = 0.05
-"""Density of the random walk of the yaw rate's error, the gyroscope's noise included [rad/s^2/sqrt(Hz)]."""
 
 
 class ParticleFilter(ParticleCloud):
@@ -45,11 +41,11 @@ class ParticleFilter(ParticleCloud):
         )
         motion: Literal["increments", "imu"] = Field(
             "increments",
-            description="what is expected between increments: constant velocity; or the yaw rate of the "
-            "gyroscope, where it comes (the tag's axes are the body's)",
+            description="what tells the motion: increments alone, or the gyroscope's yaw rate as well (the "
+            "tag's axes are the body's)",
         )
-        gyro_bias: float = Field(
-            0.02, gt=0, le=1, description="standard deviation of the gyroscope's bias [rad/s]"
+        gyro_sigma: float = Field(
+            0.03, gt=0, le=1, description="standard deviation of the gyroscope, bias included [rad/s]"
         )
         scan_likelihood: bool = Field(
             False, description="scans weigh the particles by their distance from the walls of the site"
@@ -70,23 +66,18 @@ class ParticleFilter(ParticleCloud):
         self._resample_below = config.resample_below
         self._bandwidth = config.bandwidth
         self._uses_imu = config.motion == "imu"
-        self._gyro_bias = config.gyro_bias
+        self._gyro_sigma = config.gyro_sigma
+        self._gyro_gate = float(chi2.ppf(config.increment_gate, 1))
         self._field = LikelihoodField.from_walls(setup.walls) if config.scan_likelihood else None
         self._scan_sigma = config.scan_sigma
         super().__init__(config, setup)
-
-    def reset(self) -> None:
-        """Stand at the start again, trust every anchor, and draw the same numbers again."""
-        self._rate = 0.0
-        self._rate_ns: int | None = None
-        super().reset()
 
     def update(self, measurement: Measurement) -> Report:
         """Predict to the measurement's time and take it."""
         if isinstance(measurement, Scan) and self._field is not None:
             return Report((self._update_scan(measurement, self._field),))
         if isinstance(measurement, ImuSample) and self._uses_imu:
-            return Report((self._update_rate(measurement),))
+            return self._update_rate(measurement)
         return super().update(measurement)
 
     def _update_scan(self, scan: Scan, field: LikelihoodField) -> Verdict:
@@ -114,42 +105,29 @@ class ParticleFilter(ParticleCloud):
         self._take(likelihood(self._particles), likelihood)
         return Verdict.ACCEPTED
 
-    def _update_rate(self, sample: ImuSample) -> Verdict:
-        """Take the change of the yaw rate: its bias is in each particle's own rate, and so is learned."""
+    def _update_rate(self, sample: ImuSample) -> Report:
+        """Correct every particle's yaw rate, and how it turned since the keyframe, as by an increment."""
         if self._is_late(sample.stamp_ns):
-            return Verdict.LATE
-        rate = float(sample.gyro[2])
-        if not abs(rate) < _MAX_RATE:
-            return Verdict.IMPOSSIBLE
-        is_continued = self._has_rate(sample.stamp_ns)
+            return Report((Verdict.LATE,))
+        measured = float(sample.gyro[2])
+        if not isfinite(measured):
+            return Report((Verdict.IMPOSSIBLE,))
         self._predict_to(sample.stamp_ns)
-        change, since_ns = rate - self._rate, self._rate_ns
-        self._rate, self._rate_ns = rate, sample.stamp_ns
         if self._stands:
-            return Verdict.ACCEPTED
-        if is_continued and since_ns is not None:
-            dt = (sample.stamp_ns - since_ns) * 1e-9
-            self._particles[:, 5] += change
-            self._particles[:, 2] = wrap_angles(self._particles[:, 2] + 0.5 * change * dt)
-        else:
-            self._set_rate()
-        return Verdict.ACCEPTED
-
-    def _has_rate(self, stamp_ns: int) -> bool:
-        return self._rate_ns is not None and stamp_ns - self._rate_ns < _RATE_HOLDS_NS
-
-    def _set_rate(self) -> None:
-        self._particles[:, 5] = self._rate + self._gyro_bias * self._matched_noise()[:, 2]
-
-    def _set_speed_free(self) -> None:
-        super()._set_speed_free()
-        if self._stamp_ns is not None and self._has_rate(self._stamp_ns):
-            self._set_rate()
-
-    def _noise_densities(self) -> tuple[float, float]:
-        accel_noise, yaw_accel_noise = super()._noise_densities()
-        assert self._stamp_ns is not None
-        return accel_noise, _GYRO_DRIFT if self._has_rate(self._stamp_ns) else yaw_accel_noise
+            return Report((Verdict.NOT_USED,))
+        rates, turned = self._particles[:, 5], wrap_angles(self._particles[:, 2] - self._particles[:, 8])
+        mean = float(self._weights @ rates)
+        deviations = self._weights * (rates - mean)
+        variance = float(deviations @ rates) + self._gyro_sigma**2
+        nis = (measured - mean) ** 2 / variance
+        report = np.full(1, np.nan), np.array([nis])
+        if nis > self._gyro_gate:
+            return Report((Verdict.GATED,), *report)
+        innovations = measured + self._gyro_sigma * self._matched_noise()[:, 2] - rates
+        by_turn, by_rate = float(deviations @ turned), float(deviations @ rates)
+        self._particles[:, 2] = wrap_angles(self._particles[:, 2] + by_turn / variance * innovations)
+        self._particles[:, 5] += by_rate / variance * innovations
+        return Report((Verdict.ACCEPTED,), *report)
 
     def _take(self, misfits: FloatArray, measured: Likelihood) -> None:
         left = 1.0

@@ -20,9 +20,10 @@ Posterior: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, FloatArray, Flo
 
 _POSTERIOR = f"Tuple(({VECTOR}, {MATRIX}, {VECTOR}, {MATRIX}, {MATRIX}))"
 _PULL = 2.0
-"""c1 and c2 of Eq. (21), as in `estimators.beetle_antennae`, like the three below."""
+"""c1 and c2 of Eq. (21), as in `estimators.beetle_antennae`, like the four below."""
 _FIRST_INERTIA, _LAST_INERTIA = 1.0, 0.3
 _DISTURBANCE = 0.03
+_ANTENNAE = 0.75
 MAX_HEADING_SIGMA = 0.35
 """With a less certain heading [rad] a cloud is a ring, not a Gaussian."""
 WIDER = 1.1
@@ -87,29 +88,31 @@ def search(particles: FloatArray, uniform: FloatArray, posterior: Posterior) -> 
         costs[i] = cost(start, posterior)
         for j in range(3):
             beetles[i, j] = own[i, j] = start[j]
-    half = (count + 1) // 2
-    pull = np.empty(half)
-    for i in range(half):
-        pull[i] = log(half + 0.5) - log(i + 1.0)
-    total = pull.sum()
+    smelled, smelled_costs = own.copy(), costs.copy()
     for k in range(len(uniform)):
         inertia = _FIRST_INERTIA - (_FIRST_INERTIA - _LAST_INERTIA) * k / len(uniform)  # (18)
-        order = np.argsort(costs)
-        for j in range(3):
-            centre[j] = 0.0
-            for i in range(half):
-                centre[j] += pull[i] / total * own[order[i], j]
+        leaders = min(3, (len(smelled) + 1) // 2)
+        order = np.argsort(smelled_costs)
+        centre[:] = 0.0
+        total = 0.0
+        for i in range(leaders):
+            pull = log(leaders + 0.5) - log(i + 1.0)
+            total += pull
+            for j in range(3):
+                centre[j] += pull * smelled[order[i], j]
+        smelled, smelled_costs = np.empty((2 * count, 3)), np.empty(2 * count)
         for i in range(count):
             for j in range(3):
                 place = beetles[i, j]
                 velocity[i, j] = (  # (21)
                     inertia * velocity[i, j]
                     + _PULL * uniform[k, 3 * i + j] * (own[i, j] - place)
-                    + _PULL * uniform[k, 3 * (count + i) + j] * (centre[j] - place)
+                    + _PULL * uniform[k, 3 * (count + i) + j] * (centre[j] / total - place)
                 )
-                right[j] = place + 1.5 * velocity[i, j]  # (22)
-                left[j] = place + 0.5 * velocity[i, j]  # (23)
+                smelled[i, j] = right[j] = place + (1.0 + _ANTENNAE / 2.0) * velocity[i, j]  # (22)
+                smelled[count + i, j] = left[j] = place + (1.0 - _ANTENNAE / 2.0) * velocity[i, j]  # (23)
             right_cost, left_cost = cost(right, posterior), cost(left, posterior)
+            smelled_costs[i], smelled_costs[count + i] = right_cost, left_cost
             moved = right if right_cost < left_cost else left  # (24)
             for j in range(3):
                 velocity[i, j] = moved[j] - beetles[i, j]

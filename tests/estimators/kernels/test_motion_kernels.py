@@ -1,0 +1,82 @@
+"""Kernels of the motion against plain NumPy."""
+
+import numpy as np
+import pytest
+
+from estimators.kernels import cloud, motion
+from estimators.messages import FloatArray
+from estimators.models.motion import constant_velocity
+from tests.estimators.kernels.clouds import deviations, law, random_cloud, wrapped
+
+SEEDS = pytest.mark.parametrize("seed", range(3))
+NEAR = {"rtol": 1e-9, "atol": 1e-9}
+EVEN = np.full(4000, 1 / 4000)
+COV = np.array([[4e-4, 1e-4, 0.0], [1e-4, 3e-4, 5e-5], [0.0, 5e-5, 1e-4]])
+
+
+def in_keyframe(particles: FloatArray) -> FloatArray:
+    """Motion since the keyframe and velocity (N, 6), in the keyframe's frame."""
+    turn = np.exp(-1j * particles[:, 8])
+    step = ((particles[:, 0] - particles[:, 6]) + 1j * (particles[:, 1] - particles[:, 7])) * turn
+    speed = (particles[:, 3] + 1j * particles[:, 4]) * turn
+    turned = wrapped(particles[:, 2] - particles[:, 8])
+    return np.column_stack([step.real, step.imag, turned, speed.real, speed.imag, particles[:, 5]])
+
+
+@SEEDS
+def test_move_is_that_of_numpy(seed: int) -> None:
+    particles, weights = random_cloud(seed)
+    noise = np.random.default_rng(seed).normal(size=(60, 3))
+    expected, matched = particles.copy(), noise.copy()
+    cloud.match(matched, expected, weights)
+    change = np.array([0.5, 0.5, 1.5]) * np.sqrt(0.2) * matched
+    expected[:, :3] += 0.2 * (expected[:, 3:6] + change / np.sqrt(3))
+    expected[:, 3:6] += change
+    motion.move(particles, weights, noise, 0.2, 0.5, 1.5)
+    np.testing.assert_allclose(deviations(particles, expected[0]), deviations(expected, expected[0]), **NEAR)
+
+
+def test_moving_adds_the_variances_of_constant_velocity() -> None:
+    particles = np.zeros((4000, 9))
+    noise = np.random.default_rng(0).normal(size=(4000, 3))
+    motion.move(particles, EVEN, noise, 0.3, 0.5, 1.5)
+    _, Q = constant_velocity(0.3, 0.5, 1.5)
+    np.testing.assert_allclose(np.diag(law(particles, EVEN)[1])[:6], np.diag(Q), rtol=1e-9)
+
+
+@SEEDS
+def test_an_increment_is_taken_as_numpy_does(seed: int) -> None:
+    particles, weights = random_cloud(seed)
+    noise = np.random.default_rng(seed).normal(size=(60, 3))
+    matched = noise.copy()
+    cloud.match(matched, particles, weights)
+    before = in_keyframe(particles)
+    increment = weights @ before[:, :3] + [0.02, -0.01, 0.03]
+    centred = before - weights @ before
+    joint = (weights * centred.T) @ centred[:, :3]
+    S = joint[:3] + COV
+    innovation = increment + matched @ np.linalg.cholesky(COV).T - before[:, :3]
+    expected = before + innovation @ np.linalg.solve(S, joint.T)
+    mean = increment - weights @ before[:, :3]
+    keyframes = particles[:, 6:].copy()
+    nis = motion.take_increment(particles, weights, noise, increment, COV, 1e9)
+    assert nis == pytest.approx(mean @ np.linalg.solve(S, mean), rel=1e-9)
+    np.testing.assert_allclose(in_keyframe(particles), expected, **NEAR)
+    np.testing.assert_array_equal(particles[:, 6:], keyframes)
+
+
+def test_a_gated_increment_changes_nothing() -> None:
+    particles, weights = random_cloud(0)
+    before = particles.copy()
+    far = np.array([50.0, 0.0, 0.0])
+    nis = motion.take_increment(particles, weights, np.ones((60, 3)), far, COV, 20.0)
+    assert nis > 20.0
+    np.testing.assert_array_equal(particles, before)
+
+
+def test_a_near_perfect_increment_puts_every_particle_there() -> None:
+    particles, weights = random_cloud(2)
+    noise = np.random.default_rng(0).normal(size=(60, 3))
+    increment = np.array([0.3, -0.1, 0.2])
+    motion.take_increment(particles, weights, noise, increment, 1e-14 * np.eye(3), np.inf)
+    np.testing.assert_allclose(in_keyframe(particles)[:, :3], np.tile(increment, (60, 1)), atol=1e-6)
