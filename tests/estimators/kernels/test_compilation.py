@@ -1,0 +1,41 @@
+"""Who does not make a particle filter does not wait for the compiler, and no one waits twice."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+from estimators.kernels import cloud, likelihood, motion, posterior, scan
+
+COMPILED = [
+    getattr(module, name) for module in (cloud, likelihood, motion, posterior, scan) for name in dir(module)
+]
+
+
+def test_neither_the_command_line_nor_the_table_of_estimators_loads_numba() -> None:
+    code = (
+        "import sys, companion.cli, estimators, companion.config; companion.config.default_toml();"
+        "assert 'numba' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_kernels_are_compiled_when_loaded_and_kept_on_disk() -> None:
+    kernels = {f for f in COMPILED if hasattr(f, "signatures") and f.signatures}
+    assert len(kernels) >= 15
+    for kernel in kernels:
+        # One signature, stated beforehand: no call can start the compiler.
+        assert len(kernel.signatures) == 1
+        assert kernel.stats.cache_path
+
+
+def test_a_second_process_compiles_nothing() -> None:
+    code = (
+        "from estimators.kernels import cloud, likelihood, motion, posterior, scan\n"
+        "assert not posterior.sample.stats.cache_misses, posterior.sample.stats\n"
+        "assert posterior.sample.stats.cache_hits"
+    )
+    root = Path(__file__).parents[3]
+    subprocess.run(
+        [sys.executable, "-c", code], check=True, cwd=root, env={**os.environ, "PYTHONPATH": str(root)}
+    )
