@@ -3,8 +3,11 @@
 import numpy as np
 
 from estimators.base import Report, Setup, Verdict
+from estimators.geometry import wrap_angle
+from estimators.landmark_gate import LandmarkGate
 from estimators.lidar.odometry import POSE, LidarOdometry
-from estimators.messages import FloatArray, Measurement, RangeFrame
+from estimators.messages import FloatArray, LandmarkFrame, Measurement, RangeFrame
+from estimators.models.landmark import range_and_bearing
 from estimators.models.range import horizontal_range
 from estimators.range_gate import RangeGate
 
@@ -19,21 +22,27 @@ class Ekf(LidarOdometry):
     are tested against finite differences.
     """
 
-    class Config(RangeGate.Config, LidarOdometry.Config):
+    class Config(LandmarkGate.Config, RangeGate.Config, LidarOdometry.Config):
         """Settings of `ekf`."""
 
     def __init__(self, config: Config, setup: Setup) -> None:
         self._gate = RangeGate(config, setup)
+        self._landmark_gate = LandmarkGate(config, setup)
         super().__init__(config, setup)
 
     def update(self, measurement: Measurement) -> Report:
-        """Predict to the measurement's time and take it; only ranges and increments are used."""
-        if not isinstance(measurement, RangeFrame):
-            return super().update(measurement)
-        if self._is_late(measurement.stamp_ns):
-            return Report((Verdict.LATE,) * len(measurement.ranges))
-        self._predict_to(measurement.stamp_ns)
-        return self._update_ranges(measurement)
+        """Predict to the measurement's time and take it; ranges, landmarks and increments are used."""
+        if isinstance(measurement, RangeFrame):
+            if self._is_late(measurement.stamp_ns):
+                return Report((Verdict.LATE,) * len(measurement.ranges))
+            self._predict_to(measurement.stamp_ns)
+            return self._update_ranges(measurement)
+        if isinstance(measurement, LandmarkFrame):
+            if self._is_late(measurement.stamp_ns):
+                return Report((Verdict.LATE,))
+            self._predict_to(measurement.stamp_ns)
+            return Report((self._update_landmarks(measurement),))
+        return super().update(measurement)
 
     def _place(self, pose: FloatArray, cov: FloatArray) -> None:
         super()._place(pose, cov)
@@ -56,5 +65,23 @@ class Ekf(LidarOdometry):
             nis[i] = residuals[i] ** 2 / variance
             verdicts[i] = self._gate.judge(int(frame.anchor_ids[i]), frame.stamp_ns, float(nis[i]))
             if verdicts[i] is Verdict.ACCEPTED:
-                self._correct(np.array([measured]), H, np.array([predicted]), np.array([[sigma**2]]))
+                self._correct(residuals[i : i + 1], H, np.array([[sigma**2]]))
         return Report(tuple(verdicts), residuals, nis)
+
+    def _update_landmarks(self, frame: LandmarkFrame) -> Verdict:
+        landmarks = self._landmark_gate.usable(frame)
+        if isinstance(landmarks, Verdict):
+            return landmarks
+        verdict = Verdict.GATED
+        for x, y, *measured in landmarks:
+            predicted, by_pose = range_and_bearing(self._filter.x[POSE], np.array([x, y]))
+            innovation = np.array(measured[:2]) - predicted
+            innovation[1] = wrap_angle(innovation[1])
+            H = np.zeros((2, 9))
+            H[:, POSE] = by_pose
+            R = np.diag(np.array(measured[2:]) ** 2)
+            variances = np.diag(H @ self._filter.P @ H.T + R)
+            if (innovation**2 <= self._landmark_gate.limit * variances).all():
+                self._correct(innovation, H, R)
+                verdict = Verdict.ACCEPTED
+        return verdict

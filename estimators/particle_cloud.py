@@ -9,15 +9,14 @@ gains on another. Ranges, landmarks and scans do weigh the particles.
 from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from math import isfinite
 from typing import ClassVar, TypeAlias
 
 import numpy as np
 from pydantic import Field
-from scipy.stats import chi2
 
 from estimators.base import Report, Setup, Verdict
 from estimators.geometry import lift
+from estimators.landmark_gate import LandmarkGate
 from estimators.lidar.keyframes import START_SPEED_SIGMA, KeyframeTracker
 from estimators.messages import (
     FloatArray,
@@ -59,15 +58,12 @@ class ParticleCloud(KeyframeTracker):
     counts.
     """
 
-    class Config(RangeGate.Config, KeyframeTracker.Config):
+    class Config(LandmarkGate.Config, RangeGate.Config, KeyframeTracker.Config):
         """Settings of every particle filter."""
 
         PARAMETER: ClassVar[str] = "particles"
 
         particles: int = Field(200, ge=10, le=100_000, description="number of particles")
-        landmark_gate: float = Field(
-            0.99999, gt=0.5, lt=1, description="share of good landmark ranges and bearings that pass"
-        )
         seed: int = Field(1, ge=0, description="of everything random in the filter")
 
     def __init__(self, config: Config, setup: Setup) -> None:
@@ -79,8 +75,7 @@ class ParticleCloud(KeyframeTracker):
         self._count = config.particles
         self._seed = config.seed
         self._gate = RangeGate(config, setup)
-        self._landmark_gate = float(chi2.ppf(config.landmark_gate, 1))
-        self._landmarks = {i: tuple(position.tolist()) for i, position in setup.landmarks.items()}
+        self._landmark_gate = LandmarkGate(config, setup)
         self._arm = setup.tag_in_body
         self.reset()
 
@@ -193,20 +188,18 @@ class ParticleCloud(KeyframeTracker):
         return Report(tuple(verdicts), innovations, nis)
 
     def _update_landmarks(self, frame: LandmarkFrame) -> Verdict:
-        seen = zip(frame.landmark_ids.tolist(), frame.ranges.tolist(), frame.bearings.tolist(), strict=True)
-        known = [
-            (*self._landmarks[i], r, b, frame.range_sigma, frame.bearing_sigma)
-            for i, r, b in seen
-            if i in self._landmarks
-        ]
-        if not known:
-            return Verdict.NOT_USED
-        landmarks = np.array([row for row in known if _is_possible(*row[2:])]).reshape(-1, 6)
-        if len(landmarks) == 0:
-            return Verdict.IMPOSSIBLE
+        landmarks = self._landmark_gate.usable(frame)
+        if isinstance(landmarks, Verdict):
+            return landmarks
         doubted = np.zeros(2 * len(landmarks), dtype=np.bool_)
         _, _, misfits = self._likelihood.gated_misfits(
-            self._particles, self._weights, self._arm, _NO_RANGES, landmarks, self._landmark_gate, doubted
+            self._particles,
+            self._weights,
+            self._arm,
+            _NO_RANGES,
+            landmarks,
+            self._landmark_gate.limit,
+            doubted,
         )
         if np.isinf(landmarks[:, 4]).all():
             return Verdict.GATED
@@ -219,13 +212,3 @@ def _root(cov: FloatArray) -> FloatArray:
     values, vectors = np.linalg.eigh(cov)
     root: FloatArray = vectors * np.sqrt(np.maximum(values, 0.0))
     return root
-
-
-def _is_possible(distance: float, bearing: float, range_sigma: float, bearing_sigma: float) -> bool:
-    """Whether a landmark's numbers are numbers, and positive where they must be."""
-    return (
-        0.0 < distance < np.inf
-        and isfinite(bearing)
-        and 0.0 < range_sigma < np.inf
-        and 0.0 < bearing_sigma < np.inf
-    )

@@ -87,18 +87,18 @@ class LidarOdometry(KeyframeTracker):
         predicted, by_reference, by_pose = increment(self._filter.x[REFERENCE], self._filter.x[POSE])
         H = np.zeros((3, 9))
         H[:, POSE], H[:, REFERENCE] = by_pose, by_reference
-        innovation = _increment_residual(measured.increment, predicted)
+        innovation = measured.increment - predicted
+        innovation[2] = wrap_angle(innovation[2])
         S = H @ self._filter.P @ H.T + measured.cov
         nis = float(innovation @ np.linalg.solve(S, innovation))
         report = np.full(1, np.nan), np.array([nis])
         if nis > self._increment_gate:
             return Report((Verdict.GATED,), *report)
-        self._correct(measured.increment, H, predicted, measured.cov)
+        self._correct(innovation, H, measured.cov)
         return Report((Verdict.ACCEPTED,), *report)
 
-    def _correct(self, measured: FloatArray, H: FloatArray, predicted: FloatArray, R: FloatArray) -> None:
-        residual = np.subtract if len(measured) == 1 else _increment_residual
-        self._filter.update(measured, lambda _: H, lambda _: predicted, R=R, residual=residual)
+    def _correct(self, innovation: FloatArray, H: FloatArray, R: FloatArray) -> None:
+        self._filter.update(innovation, lambda _: H, lambda _: np.zeros_like(innovation), R=R)
         for i in (2, 8):  # headings of the pose and of the reference
             self._filter.x[i] = wrap_angle(self._filter.x[i])
         self._filter.P = 0.5 * (self._filter.P + self._filter.P.T)
@@ -109,9 +109,3 @@ class LidarOdometry(KeyframeTracker):
         copy[REFERENCE, POSE] = np.eye(3)
         self._filter.x = copy @ self._filter.x
         self._filter.P = copy @ self._filter.P @ copy.T
-
-
-def _increment_residual(measured: FloatArray, predicted: FloatArray) -> FloatArray:
-    residual = measured - predicted
-    residual[2] = wrap_angle(residual[2])
-    return residual

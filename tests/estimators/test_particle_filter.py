@@ -144,23 +144,6 @@ def test_a_blocked_range_among_good_ones_is_gated_and_then_its_anchor_suspect() 
     assert again.verdicts == (good, Verdict.SUSPECT, good, good)
 
 
-def test_landmarks_that_are_no_numbers_or_unknown_do_not_count() -> None:
-    nan = float("nan")
-    rng = np.random.default_rng(0)
-    good = seen_landmarks(SECOND_NS, HALL.start.pose, rng)
-
-    def verdict(ids: list[int], ranges: list[float], bearings: list[float]) -> Verdict:
-        frame = LandmarkFrame(SECOND_NS, np.array(ids), np.array(ranges), np.array(bearings), 0.03, 0.012)
-        return standing().update(frame).verdicts[0]
-
-    assert verdict([], [], []) is Verdict.NOT_USED
-    assert verdict([77], [3.0], [0.0]) is Verdict.NOT_USED
-    assert verdict([0, 1], [nan, -1.0], [0.0, 0.0]) is Verdict.IMPOSSIBLE
-    assert verdict([0, 1], [0.0, 2.0], [0.0, nan]) is Verdict.IMPOSSIBLE
-    assert verdict([0], [float(good.ranges[0]) + 3.0], [float(good.bearings[0])]) is Verdict.GATED
-    assert verdict([0], [float(good.ranges[0])], [float(good.bearings[0])]) is Verdict.ACCEPTED
-
-
 def test_one_wrong_landmark_does_not_spoil_the_others() -> None:
     rng = np.random.default_rng(0)
     frame = seen_landmarks(SECOND_NS, HALL.start.pose, rng)
