@@ -127,7 +127,7 @@ class ParticleCloud(KeyframeTracker):
         self._gate.reset()
         self._particles = np.zeros((self._count, 9))
         self._weights = np.full(self._count, 1.0 / self._count)
-        self._particles[:, POSE] = pose + self._matched_noise() @ _root(cov).T
+        self._particles[:, POSE] = pose + self._matched_noise() @ root(cov).T
         self._particles[:, KEYFRAME] = self._particles[:, POSE]
 
     def _noise(self) -> FloatArray:
@@ -207,7 +207,7 @@ class ParticleCloud(KeyframeTracker):
         return Verdict.ACCEPTED
 
 
-def _root(cov: FloatArray) -> FloatArray:
+def root(cov: FloatArray) -> FloatArray:
     """Matrix whose product with its transpose is a covariance, which may be singular."""
     values, vectors = np.linalg.eigh(cov)
     root: FloatArray = vectors * np.sqrt(np.maximum(values, 0.0))

@@ -24,10 +24,11 @@ likelihood alone and are weighted by it as if they were samples of the prior. It
 import numpy as np
 from pydantic import Field
 
-from estimators.base import Setup
+from estimators.base import Report, Setup, Verdict
 from estimators.beetle_antennae import PrintedImprovedBeetleAntennaeSearch
-from estimators.messages import FloatArray
-from estimators.particle_cloud import POSE, Fixes, Likelihood, ParticleCloud
+from estimators.geometry import wrap_angles
+from estimators.messages import FloatArray, PoseIncrement
+from estimators.particle_cloud import KEYFRAME, POSE, VELOCITY, Fixes, Likelihood, ParticleCloud, root
 from estimators.particle_filter import ParticleFilter
 from estimators.resampling import systematic
 
@@ -108,6 +109,18 @@ class PrintedPfIbas(ParticleCloud):
     def __init__(self, config: Config, setup: Setup) -> None:
         self._iterations = config.iterations
         super().__init__(config, setup)
+
+    def _follow(self, measured: PoseIncrement) -> Report:
+        # Step 1. As little spread as is left after step 6 would hardly follow as other clouds do.
+        x, y, yaw = self._particles[:, KEYFRAME].T
+        forward, left, turn = (measured.increment + self._matched_noise() @ root(measured.cov).T).T
+        c, s = np.cos(yaw), np.sin(yaw)
+        poses = np.column_stack([x + c * forward - s * left, y + s * forward + c * left, yaw + turn])
+        moved = poses - self._particles[:, KEYFRAME]
+        self._particles[:, VELOCITY] = moved / (1e-9 * (measured.stamp_ns - measured.from_stamp_ns))
+        poses[:, 2] = wrap_angles(poses[:, 2])
+        self._particles[:, POSE] = poses
+        return Report((Verdict.ACCEPTED,))
 
     def _take(self, misfits: FloatArray, measured: Likelihood) -> None:
         if not isinstance(measured, Fixes):

@@ -35,7 +35,7 @@ def round_the_room(seed: int, **settings: object) -> tuple[FloatArray, FloatArra
     """Errors (K, 3) and NEES (K,) of every second on scans and poor increments; no range at all."""
     pf = ParticleFilter(ParticleFilter.Config.model_validate({"seed": seed, **settings}), IN_ROOM)
     rng = np.random.default_rng(seed)
-    truth = LOOP.poses(0.1 * np.arange(10 * SECONDS + 1))
+    truth = LOOP.poses(np.linspace(0.0, SECONDS, 10 * SECONDS + 1))
     errors, nees = [], []
     pf.update(PoseIncrement(0, 0, np.zeros(3), np.eye(3), is_keyframe=True))
     for k in range(1, len(truth)):

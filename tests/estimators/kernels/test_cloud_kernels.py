@@ -8,7 +8,6 @@ from estimators.kernels.cloud import LEAST_VARIANCE
 from tests.estimators.kernels.clouds import deviations, law, random_cloud, wrapped
 
 SEEDS = pytest.mark.parametrize("seed", range(3))
-NEAR = {"rtol": 1e-9, "atol": 1e-9}
 
 
 @SEEDS
@@ -18,8 +17,8 @@ def test_moments_are_those_of_numpy(seed: int, columns: int) -> None:
     mean, cov = cloud.moments(particles, weights, columns)
     expected_mean, expected_cov = law(particles, weights)
     difference = mean - expected_mean[:columns]
-    np.testing.assert_allclose(np.exp(1j * difference), 1.0, **NEAR)
-    np.testing.assert_allclose(cov, expected_cov[:columns, :columns], **NEAR)
+    np.testing.assert_allclose(np.exp(1j * difference), 1.0, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(cov, expected_cov[:columns, :columns], rtol=1e-9, atol=1e-9)
 
 
 @SEEDS
@@ -49,8 +48,8 @@ def test_pose_law_is_that_of_numpy(seed: int) -> None:
     mean, factor, gain = cloud.pose_law(particles, weights)
     expected_mean, cov = law(particles, weights)
     pose_cov = cov[:3, :3] * (1 + 1e-9 * np.eye(3)) + LEAST_VARIANCE * np.eye(3)
-    np.testing.assert_allclose(np.exp(1j * (mean - expected_mean[:3])), 1.0, **NEAR)
-    np.testing.assert_allclose(factor, np.linalg.cholesky(pose_cov), **NEAR)
+    np.testing.assert_allclose(np.exp(1j * (mean - expected_mean[:3])), 1.0, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(factor, np.linalg.cholesky(pose_cov), rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(gain, cov[3:, :3] @ np.linalg.inv(pose_cov), rtol=1e-7, atol=1e-9)
 
 
@@ -70,7 +69,9 @@ def test_put_moves_poses_and_all_else_by_the_regression(seed: int) -> None:
     expected[:, 3:] += (poses - particles[:, :3]) @ gain.T
     expected[:, :3] = poses
     cloud.put(particles, poses, gain)
-    np.testing.assert_allclose(deviations(particles, expected[0]), deviations(expected, expected[0]), **NEAR)
+    np.testing.assert_allclose(
+        deviations(particles, expected[0]), deviations(expected, expected[0]), rtol=1e-9, atol=1e-9
+    )
     assert (np.abs(particles[:, [2, 8]]) <= np.pi).all()
 
 
@@ -87,7 +88,9 @@ def test_resampled_particles_are_the_shrunk_and_spread_ones_of_numpy(seed: int) 
     away = expected[:, :3] - mean
     away[:, 2] = wrapped(away[:, 2])
     cloud.put(expected, mean + np.sqrt(1 - 0.4**2) * away + 0.4 * noise @ factor.T, gain)
-    np.testing.assert_allclose(deviations(new, expected[0]), deviations(expected, expected[0]), **NEAR)
+    np.testing.assert_allclose(
+        deviations(new, expected[0]), deviations(expected, expected[0]), rtol=1e-9, atol=1e-9
+    )
 
 
 def test_resampling_by_equal_weights_keeps_mean_and_covariance_of_the_pose() -> None:

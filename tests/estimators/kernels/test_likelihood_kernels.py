@@ -7,14 +7,15 @@ from estimators.kernels import likelihood
 from tests.estimators.kernels.clouds import ARM, LANDMARKS, RANGES, predicted, random_cloud, sigmas
 
 SEEDS = pytest.mark.parametrize("seed", range(3))
-NEAR = {"rtol": 1e-9, "atol": 1e-9}
 
 
 @SEEDS
 def test_residuals_and_misfits_are_those_of_numpy(seed: int) -> None:
     particles, _ = random_cloud(seed)
     expected = predicted(particles, RANGES, LANDMARKS)
-    np.testing.assert_allclose(likelihood.residuals(particles, ARM, RANGES, LANDMARKS), expected, **NEAR)
+    np.testing.assert_allclose(
+        likelihood.residuals(particles, ARM, RANGES, LANDMARKS), expected, rtol=1e-9, atol=1e-9
+    )
     misfits = 0.5 * ((expected / sigmas(RANGES, LANDMARKS)) ** 2).sum(axis=1)
     np.testing.assert_allclose(likelihood.misfits(particles, ARM, RANGES, LANDMARKS), misfits, rtol=1e-9)
 

@@ -9,7 +9,6 @@ from estimators.models.motion import constant_velocity
 from tests.estimators.kernels.clouds import deviations, law, random_cloud, wrapped
 
 SEEDS = pytest.mark.parametrize("seed", range(3))
-NEAR = {"rtol": 1e-9, "atol": 1e-9}
 EVEN = np.full(4000, 1 / 4000)
 COV = np.array([[4e-4, 1e-4, 0.0], [1e-4, 3e-4, 5e-5], [0.0, 5e-5, 1e-4]])
 
@@ -33,7 +32,9 @@ def test_move_is_that_of_numpy(seed: int) -> None:
     expected[:, :3] += 0.2 * (expected[:, 3:6] + change / np.sqrt(3))
     expected[:, 3:6] += change
     motion.move(particles, weights, noise, 0.2, 0.5, 1.5)
-    np.testing.assert_allclose(deviations(particles, expected[0]), deviations(expected, expected[0]), **NEAR)
+    np.testing.assert_allclose(
+        deviations(particles, expected[0]), deviations(expected, expected[0]), rtol=1e-9, atol=1e-9
+    )
 
 
 def test_moving_adds_the_variances_of_constant_velocity() -> None:
@@ -61,7 +62,7 @@ def test_an_increment_is_taken_as_numpy_does(seed: int) -> None:
     keyframes = particles[:, 6:].copy()
     nis = motion.take_increment(particles, weights, noise, increment, COV, 1e9)
     assert nis == pytest.approx(mean @ np.linalg.solve(S, mean), rel=1e-9)
-    np.testing.assert_allclose(in_keyframe(particles), expected, **NEAR)
+    np.testing.assert_allclose(in_keyframe(particles), expected, rtol=1e-9, atol=1e-9)
     np.testing.assert_array_equal(particles[:, 6:], keyframes)
 
 

@@ -79,7 +79,7 @@ def test_the_beetles_are_those_of_the_plain_search(seed: int) -> None:
     mean, factor = law[:2]
     away = particles[:, :3] - mean
     away[:, 2] = np.angle(np.exp(1j * away[:, 2]))
-    starts = np.linalg.solve(factor, away.T).T
+    starts = np.asarray(np.linalg.solve(factor, away.T).T, dtype=np.float64)
 
     def costs(points: FloatArray) -> FloatArray:
         return np.array([plain_cost(point, law) for point in points])

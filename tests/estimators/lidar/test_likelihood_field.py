@@ -43,7 +43,9 @@ def test_distances_from_walls_are_right_to_a_cell() -> None:
 def scan(angles: list[float], ranges: list[float]) -> Scan:
     """A scan whose beams come 1 ms after each other."""
     count = len(angles)
-    return Scan(0, np.array(angles), np.array(ranges), 1e-3 * np.arange(count), np.zeros(count))
+    return Scan(
+        0, np.array(angles), np.array(ranges), np.linspace(0.0, 1e-3 * (count - 1), count), np.zeros(count)
+    )
 
 
 def test_beams_that_did_not_come_back_are_left_out() -> None:
