@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -116,4 +116,19 @@ class Estimator(Protocol):
 
     def pose_at(self, stamp_ns: int) -> PoseEstimate | None:
         """Pose at a time near the newest measurement, without changing the state; None when unknown."""
+        ...
+
+
+@runtime_checkable
+class Settable(Estimator, Protocol):
+    """An estimator that can be told where the robot is."""
+
+    def start_at(self, stamp_ns: int, pose: FloatArray, cov: FloatArray) -> None:
+        """Forget the past: at this moment the robot is here, and moves freely from then on.
+
+        Args:
+            stamp_ns: the moment; it may be earlier than measurements already taken.
+            pose: (3,) x [m], y [m], yaw [rad] of the body, map frame.
+            cov: (3, 3) covariance of the same.
+        """
         ...

@@ -4,7 +4,7 @@ import numpy as np
 
 from estimators.base import Report, Setup, Verdict
 from estimators.lidar.odometry import POSE, LidarOdometry
-from estimators.messages import Measurement, RangeFrame
+from estimators.messages import FloatArray, Measurement, RangeFrame
 from estimators.models.range import horizontal_range
 from estimators.range_gate import RangeGate
 
@@ -26,11 +26,6 @@ class Ekf(LidarOdometry):
         self._gate = RangeGate(config, setup)
         super().__init__(config, setup)
 
-    def reset(self) -> None:
-        """Stand at the start again and trust every anchor."""
-        super().reset()
-        self._gate.reset()
-
     def update(self, measurement: Measurement) -> Report:
         """Predict to the measurement's time and take it; only ranges and increments are used."""
         if not isinstance(measurement, RangeFrame):
@@ -39,6 +34,10 @@ class Ekf(LidarOdometry):
             return Report((Verdict.LATE,) * len(measurement.ranges))
         self._predict_to(measurement.stamp_ns)
         return self._update_ranges(measurement)
+
+    def _place(self, pose: FloatArray, cov: FloatArray) -> None:
+        super()._place(pose, cov)
+        self._gate.reset()
 
     def _update_ranges(self, frame: RangeFrame) -> Report:
         count = len(frame.ranges)

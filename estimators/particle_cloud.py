@@ -66,16 +66,8 @@ class ParticleCloud(KeyframeTracker):
 
     def reset(self) -> None:
         """Stand at the start again, trust every anchor, and draw the same numbers again."""
-        super().reset()
-        self._gate.reset()
         self._rng = np.random.default_rng(self._seed)
-        self._count = self._usual_count
-        self._particles = np.zeros((self._count, 12))
-        self._weights = np.full(self._count, 1.0 / self._count)
-        start = self._setup.start
-        self._particles[:, POSE] = start.pose + start.sigma * self._noise_beside(POSE)
-        self._particles[:, KEYFRAME] = self._particles[:, LAST] = self._particles[:, POSE]
-        self._last_ns = 0
+        super().reset()
 
     @property
     def particles(self) -> tuple[FloatArray, FloatArray]:
@@ -105,7 +97,7 @@ class ParticleCloud(KeyframeTracker):
         F, Q = constant_velocity(dt, *self._accel_noise)
         planar = (F @ cov @ F.T + Q)[POSE, POSE]
         cov = self._setup.lift_covariance(0.5 * (planar + planar.T) + self._cloud.LEAST_VARIANCE * np.eye(3))
-        return PoseEstimate(stamp_ns, lift((F @ mean)[POSE], self._setup.height), cov, reset_counter=0)
+        return PoseEstimate(stamp_ns, lift((F @ mean)[POSE], self._setup.height), cov, self._reset_counter)
 
     @abstractmethod
     def _settle(
@@ -119,6 +111,15 @@ class ParticleCloud(KeyframeTracker):
             ranges: (M, 4) as in `estimators.kernels`; those with infinite sigma do not count.
             landmarks: (L, 6) likewise.
         """
+
+    def _place(self, pose: FloatArray, cov: FloatArray) -> None:
+        self._gate.reset()
+        self._count = self._usual_count
+        self._particles = np.zeros((self._count, 12))
+        self._weights = np.full(self._count, 1.0 / self._count)
+        self._particles[:, POSE] = pose + self._noise_beside(POSE) @ _root(cov).T
+        self._particles[:, KEYFRAME] = self._particles[:, LAST] = self._particles[:, POSE]
+        self._last_ns = self._stamp_ns or 0
 
     def _noise_beside(self, columns: slice) -> FloatArray:
         """Standard normal numbers (N, 3) beside columns of the particles, see `kernels.cloud.match`."""
@@ -142,8 +143,7 @@ class ParticleCloud(KeyframeTracker):
         report = np.full(1, np.nan), np.array([nis])
         if nis > self._increment_gate:
             return Report((Verdict.GATED,), *report)
-        values, vectors = np.linalg.eigh(measured.cov)
-        noise = self._noise_beside(KEYFRAME) @ (vectors * np.sqrt(values)).T
+        noise = self._noise_beside(KEYFRAME) @ _root(measured.cov).T
         assert self._stamp_ns is not None
         dt = (self._stamp_ns - self._last_ns) * 1e-9
         self._cloud.follow(self._particles, measured.increment + noise, dt)
@@ -217,6 +217,13 @@ class ParticleCloud(KeyframeTracker):
         before = self._weights.copy()
         effective = self._likelihood.reweigh(self._weights, residuals, sigmas_of(ranges, landmarks))
         self._settle(before, effective, ranges, landmarks)
+
+
+def _root(cov: FloatArray) -> FloatArray:
+    """Matrix whose product with its transpose is a covariance, which may be singular."""
+    values, vectors = np.linalg.eigh(cov)
+    root: FloatArray = vectors * np.sqrt(np.maximum(values, 0.0))
+    return root
 
 
 def _is_possible(distance: float, bearing: float, range_sigma: float, bearing_sigma: float) -> bool:

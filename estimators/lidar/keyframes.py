@@ -48,10 +48,29 @@ class KeyframeTracker(ABC):
 
     def reset(self) -> None:
         """Stand at the start again; the first measurement sets the clock."""
-        self._stands_until_ns: int | None = None
-        self._stands = True
         self._stamp_ns: int | None = None
+        self._stands_until_ns: int | None = None
         self._reference_stamp_ns: int | None = None
+        self._stands = True
+        self._reset_counter = 0
+        start = self._setup.start
+        self._place(start.pose, np.diag(start.sigma**2))
+
+    def start_at(self, stamp_ns: int, pose: FloatArray, cov: FloatArray) -> None:
+        """Forget the past: at this moment the robot is here, and moves freely from then on.
+
+        Increments that start at this moment are followed; those from earlier keyframes no longer are.
+
+        Args:
+            stamp_ns: the moment; it may be earlier than measurements already taken.
+            pose: (3,) x [m], y [m], yaw [rad] of the body, map frame.
+            cov: (3, 3) covariance of the same.
+        """
+        self._stamp_ns = self._stands_until_ns = self._reference_stamp_ns = stamp_ns
+        self._stands = False
+        self._reset_counter += 1
+        self._place(pose, cov)
+        self._set_speed_free()
 
     def update(self, measurement: Measurement) -> Report:
         """Predict to an increment's time and take it; other measurements are not used."""
@@ -65,6 +84,10 @@ class KeyframeTracker(ABC):
             return report
         count = len(measurement.ranges) if isinstance(measurement, RangeFrame) else 1
         return Report((Verdict.NOT_USED,) * count)
+
+    @abstractmethod
+    def _place(self, pose: FloatArray, cov: FloatArray) -> None:
+        """Forget everything: the pose, which is the reference too, is this, and the speed zero."""
 
     @abstractmethod
     def _set_speed_free(self) -> None:

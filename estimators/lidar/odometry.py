@@ -38,16 +38,6 @@ class LidarOdometry(KeyframeTracker):
         super().__init__(config, setup)
         self.reset()
 
-    def reset(self) -> None:
-        """Stand at the start again; the first measurement sets the clock."""
-        super().reset()
-        start = self._setup.start
-        self._filter = ExtendedKalmanFilter(dim_x=9, dim_z=3)
-        self._filter.x = np.concatenate([start.pose, np.zeros(3), start.pose])
-        sigma = np.concatenate([start.sigma, np.zeros(3), start.sigma])
-        self._filter.P = np.diag(sigma**2)
-        self._heading_known = True
-
     @property
     def state(self) -> tuple[FloatArray, FloatArray]:
         """State (9,) and covariance (9, 9) at the newest measurement, for tests."""
@@ -67,10 +57,19 @@ class LidarOdometry(KeyframeTracker):
             cov[2, :2] = cov[:2, 2] = 0.0
             cov[2, 2] = np.inf
         T_map_body = lift(mean[POSE], self._setup.height)
-        return PoseEstimate(stamp_ns, T_map_body, self._setup.lift_covariance(cov), 0)
+        return PoseEstimate(stamp_ns, T_map_body, self._setup.lift_covariance(cov), self._reset_counter)
 
     def _motion(self, dt: float) -> tuple[FloatArray, FloatArray]:
         return constant_velocity(dt, *self._accel_noise)
+
+    def _place(self, pose: FloatArray, cov: FloatArray) -> None:
+        self._filter = ExtendedKalmanFilter(dim_x=9, dim_z=3)
+        self._filter.x = np.concatenate([pose, np.zeros(3), pose])
+        self._filter.P = np.zeros((9, 9))
+        for rows in (POSE, REFERENCE):
+            for columns in (POSE, REFERENCE):
+                self._filter.P[rows, columns] = cov
+        self._heading_known = True
 
     def _set_speed_free(self) -> None:
         self._filter.P[3:6, 3:6] = np.eye(3) * START_SPEED_SIGMA**2
