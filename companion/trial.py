@@ -120,7 +120,7 @@ def _make(scenario: Scenario, setup: Setup, choice: str) -> Estimator:
     if choice == UWB_ALONE:
         choice = "least_squares"
     settings = chosen_settings(scenario.config, choice, "--estimators")
-    return make_estimator(split_choice(choice)[0], settings, setup)
+    return make_estimator(split_choice(choice)[0], settings, setup, scenario.config.relocation)
 
 
 def _step_through(
