@@ -22,6 +22,8 @@ DOUBTFUL_LOSS = 0.75
 """Mean loss of a range above which a pose is compared with what a search finds; good ranges have 0.5 at most."""
 CLEARLY_LESS, CLEARLY_BELOW = 1.5, 5.0
 """Another pose must have this many times the loss, and so much more, to be ruled out."""
+LEAST_AGREEING = 0.5
+"""Least share of ranges that agree in every third of the way: it must not begin or end elsewhere."""
 MOST_MEAN_SQUARE = 2.0
 """Of normalised residuals; a wrong pose that seems to explain all ranges explains them badly."""
 LOST_YAW_SIGMA = 0.35
@@ -153,7 +155,11 @@ class Recovering:
             return None, "ranges to two anchors at least are needed"
         if float(np.rad2deg(np.sqrt(found.cov[2, 2]))) > self._config.max_sigma_yaw_deg:
             return None, "drive a metre"
-        if found.agreeing < self._config.min_agreeing or found.mean_square > MOST_MEAN_SQUARE:
+        if (
+            found.agreeing < self._config.min_agreeing
+            or found.least_agreeing < LEAST_AGREEING
+            or found.mean_square > MOST_MEAN_SQUARE
+        ):
             return None, f"ranges contradict each other, {found.agreeing:.0%} agree"
         if not _is_clearly_less(found.loss, found.rival):
             return None, "ranges fit two places, drive a curve"

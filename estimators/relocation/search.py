@@ -27,8 +27,15 @@ SHORT_LIMIT = 3.0
 """Where the loss of a range that is too short goes on as a straight line [sigma]."""
 HEADINGS = 8
 """Tried at every place: 45 deg apart, so that one is 22.5 deg off at most."""
-SOFTENING = (4.0, 2.0, *[1.0] * 12)
+SEED_ANCHORS = 5
+"""So many of the nearest anchors, whose ranges are blocked least often, give places to begin at."""
+COARSE_SHARE = 4
+"""The first steps use every so manieth range of each anchor."""
+COARSE_STEPS = (4.0, 2.0, 1.0, 1.0)
 """Factors on all sigmas, a Gauss-Newton step each: at first distant minima draw, too."""
+FINE_STEPS = (1.0,) * 8
+FINALISTS = 16
+"""So many of the best poses go on with all ranges."""
 LONGEST_STEP = np.array([1.0, 1.0, 0.6])
 """[m, m, rad]: a straight line is no good likeness of a circle further on."""
 SAME_PLACE = np.array([0.3, 0.3, 0.35])
@@ -44,6 +51,7 @@ class Minimum:
         cov: (3, 3), odometry's drift and the anchors' biases included.
         loss: total of all ranges.
         agreeing: share of ranges within `SHORT_LIMIT` sigma.
+        least_agreeing: the same in that third of the ranges where it is least; in stamp order.
         mean_square: of these, normalised.
         rival: loss of the best other minimum, infinite when there is none.
     """
@@ -52,6 +60,7 @@ class Minimum:
     cov: FloatArray
     loss: float
     agreeing: float
+    least_agreeing: float
     mean_square: float
     rival: float
 
@@ -82,12 +91,10 @@ def find_pose(placed: PlacedRanges, bias_sigma: float) -> Minimum | None:
     poses = _seeds(placed)
     if not len(poses):
         return None
-    for softening in SOFTENING:
-        residuals, jacobian = _residuals(placed, poses)
-        information, gradient = _normal_equations(placed, residuals, jacobian, softening)
-        information += 1e-6 * np.trace(information, axis1=1, axis2=2)[:, None, None] * np.eye(3)
-        step = np.linalg.solve(information, gradient[:, :, None])[:, :, 0]
-        poses = poses + np.clip(step, -LONGEST_STEP, LONGEST_STEP)
+    coarse = placed.some(np.argsort(placed.anchor_ids, kind="stable")[::COARSE_SHARE])
+    poses = _descend(coarse, poses, COARSE_STEPS)
+    poses = poses[np.argsort(total_loss(coarse, poses), kind="stable")[:FINALISTS]]
+    poses = _descend(placed, poses, FINE_STEPS)
     losses = total_loss(placed, poses)
     best = int(np.argmin(losses))
     apart = np.abs(poses - poses[best])
@@ -105,9 +112,21 @@ def find_pose(placed: PlacedRanges, bias_sigma: float) -> Minimum | None:
         cov=cov,
         loss=float(losses[best]),
         agreeing=float(agreeing.mean()),
+        least_agreeing=min(float(third.mean()) for third in np.array_split(agreeing, 3)),
         mean_square=float((residuals[0, agreeing] ** 2).mean()) if agreeing.any() else np.inf,
         rival=float(others.min()) if len(others) else np.inf,
     )
+
+
+def _descend(placed: PlacedRanges, poses: FloatArray, steps: tuple[float, ...]) -> FloatArray:
+    """Gauss-Newton steps on every pose (S, 3)."""
+    for softening in steps:
+        residuals, jacobian = _residuals(placed, poses)
+        information, gradient = _normal_equations(placed, residuals, jacobian, softening)
+        information += 1e-6 * np.trace(information, axis1=1, axis2=2)[:, None, None] * np.eye(3)
+        step = np.linalg.solve(information, gradient[:, :, None])[:, :, 0]
+        poses = poses + np.clip(step, -LONGEST_STEP, LONGEST_STEP)
+    return poses
 
 
 def _residuals(placed: PlacedRanges, poses: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -144,6 +163,7 @@ def _seeds(placed: PlacedRanges) -> FloatArray:
     near = np.argsort(((placed.tags - middle) ** 2).sum(axis=1), kind="stable")
     _, first = np.unique(placed.anchor_ids[near], return_index=True)
     chosen = near[first]
+    chosen = chosen[np.argsort(placed.ranges[chosen], kind="stable")[:SEED_ANCHORS]]
     places = [
         place
         for i, k in combinations(chosen, 2)

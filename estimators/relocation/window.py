@@ -1,7 +1,7 @@
 """The last seconds of odometry, as one rigid piece of way, with the ranges that were measured along it."""
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -42,6 +42,18 @@ class PlacedRanges:
     step_poses: FloatArray
     step_ends: FloatArray
     step_covs: FloatArray
+
+    def some(self, index: IntArray) -> "PlacedRanges":
+        """Only the ranges at these indices."""
+        return replace(
+            self,
+            tags=self.tags[index],
+            anchors=self.anchors[index],
+            anchor_ids=self.anchor_ids[index],
+            ranges=self.ranges[index],
+            sigmas=self.sigmas[index],
+            steps=self.steps[index],
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
