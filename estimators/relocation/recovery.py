@@ -9,7 +9,7 @@ from estimators.base import Report, Settable, Setup, Verdict
 from estimators.geometry import compose, inverse
 from estimators.messages import FloatArray, Measurement, PoseEstimate, PoseIncrement, RangeFrame
 from estimators.range_gate import RangeGate
-from estimators.relocation.search import Minimum, find_pose, lies_outside, total_loss
+from estimators.relocation.search import Minimum, find_pose, lies_outside, too_short, total_loss
 from estimators.relocation.window import PlacedRanges, Window
 
 SHORTER = (1.0, 0.5)
@@ -28,6 +28,8 @@ MOST_MEAN_SQUARE = 2.0
 """Of normalised residuals; a wrong pose that seems to explain all ranges explains them badly."""
 LOST_YAW_SIGMA = 0.35
 """With less certain a heading than this [rad] a filter is set to what is found without further proof."""
+MOST_TOO_SHORT = 0.1
+"""Share of ranges too short for a filter's pose above which it may be wrong: what blocks a range lengthens it."""
 OUTSIDE = 0.999
 """Confidence with which a found pose must differ from the filter's."""
 
@@ -36,8 +38,8 @@ class Recovering:
     """A filter together with a search that needs none.
 
     Before the start is known there is no pose. A known filter is only disturbed when the last seconds' ranges
-    agree, nearly all of them and along the whole way, on one other pose, and clearly not on its own. Ranges of
-    blocked anchors do not: what is too long at one place is so by another amount at the next.
+    agree, most of them and along the whole way, on one other pose, clearly not on its own, and some are too short
+    for its own: blocked anchors only lengthen ranges, so they do not move a filter that is right.
 
     Args:
         wrapped: the filter.
@@ -181,6 +183,14 @@ def _is_clearly_less(loss: float, other: float) -> bool:
 
 
 def _rules_out(found: Minimum, placed: PlacedRanges, held: FloatArray, cov: FloatArray) -> bool:
-    """Whether a filter that holds this pose (3,) with this covariance (3, 3) must be wrong."""
+    """Whether a filter that holds this pose (3,) with this covariance (3, 3) must be wrong.
+
+    Two anchors of four that are blocked alike fit a wrong place with a third one better than the right place
+    without. But at the right place no range is too short.
+    """
     loss = float(total_loss(placed, held[None])[0])
-    return _is_clearly_less(found.loss, loss) and lies_outside(found.pose, held, found.cov + cov, OUTSIDE)
+    return (
+        too_short(placed, held) > MOST_TOO_SHORT
+        and _is_clearly_less(found.loss, loss)
+        and lies_outside(found.pose, held, found.cov + cov, OUTSIDE)
+    )

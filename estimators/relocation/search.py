@@ -75,6 +75,12 @@ def total_loss(placed: PlacedRanges, poses: FloatArray) -> FloatArray:
     return losses
 
 
+def too_short(placed: PlacedRanges, pose: FloatArray) -> float:
+    """Share of ranges that are too short by more than `SHORT_LIMIT` if the way's frame stood at a pose (3,)."""
+    residuals, _ = _residuals(placed, pose[None])
+    return float((residuals < -SHORT_LIMIT).mean())
+
+
 def find_pose(placed: PlacedRanges, bias_sigma: float) -> Minimum | None:
     """The pose with the least loss.
 
