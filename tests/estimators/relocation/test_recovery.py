@@ -92,7 +92,7 @@ def test_bad_ranges_are_told_while_the_start_is_unknown() -> None:
 
 def test_anchors_nearly_in_line_are_no_ground_for_a_guess() -> None:
     in_line = replace(
-        ROOM, anchors={**with_anchors(1, 2).anchors, 5: np.array([4.0, 0.45, 2.0]), 6: np.array([6.0, 0.2, 2.0])}
+        ROOM, anchors={**with_anchors(1, 2).anchors, 5: np.array([4.0, 0.32, 2.0]), 6: np.array([6.0, 0.2, 2.0])}
     )
     robot = Robot(in_line, 2)
     estimator = recovering("ekf", in_line)
