@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from estimators.geometry import wrap_angles
@@ -34,8 +35,8 @@ COARSE_SHARE = 4
 COARSE_STEPS = (4.0, 2.0, 1.0, 1.0)
 """Factors on all sigmas, a Gauss-Newton step each: at first distant minima draw, too."""
 FINE_STEPS = (1.0,) * 8
-FINALISTS = 16
-"""So many of the best poses go on with all ranges."""
+FINALISTS = 12
+"""So many of the best poses that are not the same go on with all ranges."""
 LONGEST_STEP = np.array([1.0, 1.0, 0.6])
 """[m, m, rad]: a straight line is no good likeness of a circle further on."""
 SAME_PLACE = np.array([0.3, 0.3, 0.35])
@@ -99,13 +100,11 @@ def find_pose(placed: PlacedRanges, bias_sigma: float) -> Minimum | None:
         return None
     coarse = placed.some(np.argsort(placed.anchor_ids, kind="stable")[::COARSE_SHARE])
     poses = _descend(coarse, poses, COARSE_STEPS)
-    poses = poses[np.argsort(total_loss(coarse, poses), kind="stable")[:FINALISTS]]
+    poses = _best_apart(poses, total_loss(coarse, poses))
     poses = _descend(placed, poses, FINE_STEPS)
     losses = total_loss(placed, poses)
     best = int(np.argmin(losses))
-    apart = np.abs(poses - poses[best])
-    apart[:, 2] = np.abs(wrap_angles(apart[:, 2]))
-    others = losses[(apart > SAME_PLACE).any(axis=1)]
+    others = losses[_is_elsewhere(poses, poses[best])]
     pose = poses[best]
     pose[2] = float(wrap_angles(pose[2:])[0])
     residuals, jacobian = _residuals(placed, pose[None])
@@ -122,6 +121,23 @@ def find_pose(placed: PlacedRanges, bias_sigma: float) -> Minimum | None:
         mean_square=float((residuals[0, agreeing] ** 2).mean()) if agreeing.any() else np.inf,
         rival=float(others.min()) if len(others) else np.inf,
     )
+
+
+def _best_apart(poses: FloatArray, losses: FloatArray) -> FloatArray:
+    """The poses of least loss, one of each place."""
+    left = poses[np.argsort(losses, kind="stable")]
+    kept = []
+    while len(left) and len(kept) < FINALISTS:
+        kept.append(left[0])
+        left = left[_is_elsewhere(left, left[0])]
+    return np.array(kept)
+
+
+def _is_elsewhere(poses: FloatArray, pose: FloatArray) -> NDArray[np.bool_]:
+    """Which of the poses (S, 3) are not the same as one (3,)."""
+    apart = np.abs(poses - pose)
+    apart[:, 2] = np.abs(wrap_angles(apart[:, 2]))
+    return np.asarray((apart > SAME_PLACE).any(axis=1))
 
 
 def _descend(placed: PlacedRanges, poses: FloatArray, steps: tuple[float, ...]) -> FloatArray:
