@@ -8,7 +8,15 @@ from typing import Annotated, Any, Self, TypeVar
 
 import numpy as np
 import tomli_w
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model, field_validator, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    create_model,
+    field_validator,
+    model_validator,
+)
 
 from companion.errors import UserError
 from drivers import SENSORS, sensor_config_class
@@ -213,7 +221,9 @@ class Config(Table):
     @classmethod
     def _finds_the_start(cls, relocation: Recovering.Config, info: Any) -> Recovering.Config:
         if not relocation.enabled and "start" in info.data and not info.data["start"].known:
-            raise ValueError("enabled must be true to find the start, which start.known = false says is unknown")
+            raise ValueError(
+                "enabled must be true to find the start, which start.known = false says is unknown"
+            )
         return relocation
 
     def estimator_config(self, name: str) -> BaseModel:

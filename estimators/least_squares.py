@@ -12,7 +12,6 @@ from estimators.messages import FloatArray, Measurement, PoseEstimate, RangeFram
 from estimators.models.range import reduce_height
 from estimators.trilateration import AnchorGeometryError, Fix, trilaterate
 
-
 REACHED = float(chi2.ppf(0.997, 2))
 """NIS of a step from the last fix to this one, up to which the tag can have made it."""
 
@@ -21,7 +20,8 @@ class LeastSquares:
     """Weighted least-squares position of every range frame.
 
     Where two positions fit alike, as with two anchors or with several in line, it takes the one that the last
-    fix leaves possible, or none. It knows no heading, so the body is taken to be at the tag and the lever arm enters the covariance.
+    fix leaves possible, or none. It knows no heading, so the body is taken to be at the tag and the lever arm
+    enters the covariance.
 
     Source: huang2024 Eq. (3)-(4); li2022 "least squares".
     """

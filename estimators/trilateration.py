@@ -132,7 +132,7 @@ def circle_intersections(
 
 
 def _closed_form(local: FloatArray, ranges: FloatArray, across: FloatArray) -> tuple[FloatArray, float]:
-    """Position (2,) on the anchors' best-fit line, and the signed distance from it; all relative to the centre."""
+    """Position (2,) on the anchors' best-fit line, and signed distance from it; relative to the centre."""
     # |p - a_i|^2 = r_i^2 minus the mean of the same equations leaves 2 (a_i - mean) p on the left.
     square = (local**2).sum(axis=1) - ranges**2
     right = square - square.mean()
@@ -146,9 +146,7 @@ def _closed_form(local: FloatArray, ranges: FloatArray, across: FloatArray) -> t
     return foot, float(np.sqrt(max(left_over, 0.0)))
 
 
-def _iterate(
-    anchors: FloatArray, ranges: FloatArray, sigmas: FloatArray, start: FloatArray
-) -> Fix | None:
+def _iterate(anchors: FloatArray, ranges: FloatArray, sigmas: FloatArray, start: FloatArray) -> Fix | None:
     """The minimum near a start; None where it leaves a direction open."""
 
     def offsets(position: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from companion.sim.ranging import draw_ranging
+from companion.sim.ranging import draw_delay_biases, draw_ranging
 from companion.sim.scenario import Scenario
 from companion.sim.scenario_tables import IncrementsTable, KidnapTable, LandmarksTable
 from companion.sim.simulate import START_NS
@@ -136,6 +136,7 @@ def _range_frames(scenario: Scenario, rng: np.random.Generator) -> tuple[list[Ra
     tags = np.column_stack([transform_each(poses, lever_arm[None, :2]), tag_height])
     clear = np.array([world.line_of_sight(tag, anchors) for tag in tags])
     distances = np.linalg.norm(anchors - tags[:, None], axis=2)
+    distances += draw_delay_biases(uwb, len(ids), rng)
     drawn = draw_ranging(uwb, distances, clear, rng)
     frames = [
         RangeFrame(

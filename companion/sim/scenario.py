@@ -78,6 +78,9 @@ class UwbTable(Table):
     other_traffic: bool = Field(False, description="user data, text and complaints on the same port")
     rate: float = Field(25.0, ge=1, le=200, description="frames a second [Hz]")
     sigma: float = Field(0.10, ge=0, le=5, description="standard deviation of a range [m]")
+    delay_sigma_ns: float = Field(
+        0.0, ge=0, le=100, description="how little each anchor's answering delay is known; 1 ns is 15 cm [ns]"
+    )
     nlos_least: float = Field(0.2, ge=0, le=10, description="least bias of a blocked range [m]")
     nlos_mean: float = Field(0.3, ge=0, le=10, description="mean of the exponential bias on top of that [m]")
     dropout: float = Field(0.02, ge=0, lt=1, description="share of ranges that fail")
@@ -218,7 +221,9 @@ def load_scenario(path: Path, seed: int | None, sets: list[str]) -> Scenario:
         boxes += table.draw(rng)
     trajectory: Walk = GaitTrajectory(straight, walk.rest, file.gait, rng) if file.gait else straight
     if start.known and walk.random:
-        raise UserError(f"{path}: random waypoints start anywhere: the site needs start.known = false (--set)")
+        raise UserError(
+            f"{path}: random waypoints start anywhere: the site needs start.known = false (--set)"
+        )
     if start.known and not np.allclose(trajectory.start, start.pose, atol=1e-3):
         x, y, yaw = trajectory.start
         raise UserError(

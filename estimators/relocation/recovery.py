@@ -19,7 +19,7 @@ LEAST_SPREAD = 0.1
 MOST_SIGMA_XY = 0.3
 """A found position less certain than this [m] is not taken."""
 DOUBTFUL_LOSS = 0.75
-"""Mean loss of a range above which a pose is compared with what a search finds; good ranges have 0.5 at most."""
+"""Mean loss of a range above which a pose is compared with what a search finds; that of good ones is 0.5."""
 CLEARLY_LESS, CLEARLY_BELOW = 1.5, 5.0
 """Another pose must have this many times the loss, and so much more, to be ruled out."""
 LEAST_AGREEING = 0.5
@@ -29,7 +29,7 @@ MOST_MEAN_SQUARE = 2.0
 LOST_YAW_SIGMA = 0.35
 """With less certain a heading than this [rad] a filter is set to what is found without further proof."""
 MOST_TOO_SHORT = 0.1
-"""Share of ranges too short for a filter's pose above which it may be wrong: what blocks a range lengthens it."""
+"""Share of ranges too short for a filter's pose above which it may be wrong: blocked ones are too long."""
 OUTSIDE = 0.999
 """Confidence with which a found pose must differ from the filter's."""
 
@@ -38,8 +38,8 @@ class Recovering:
     """A filter together with a search that needs none.
 
     Before the start is known there is no pose. A known filter is only disturbed when the last seconds' ranges
-    agree, most of them and along the whole way, on one other pose, clearly not on its own, and some are too short
-    for its own: blocked anchors only lengthen ranges, so they do not move a filter that is right.
+    agree, most of them and along the whole way, on one other pose, clearly not on its own, and some are too
+    short for its own: blocked anchors only lengthen ranges, so they do not move a filter that is right.
 
     Args:
         wrapped: the filter.

@@ -1,9 +1,9 @@
 """The pose that ranges along a piece of way speak for, from nothing.
 
-The way is rigid, so three numbers are looked for: x, y and yaw of its frame in the map. Each range has a loss
-that is quadratic for what noise explains and bounded for what is too long, as ranges are that something blocks; it
-is never so for what is too short. Circles of any two anchors give places to begin at, all headings around are
-tried, and Gauss-Newton steps on all of them together end in the minima.
+The way is rigid, so three numbers are looked for: x, y and yaw of its frame in the map. The loss of a range
+is quadratic for what noise explains. For one that is too long, as ranges are that something blocks, it is
+bounded; for one that is too short never. Circles of any two anchors give places to begin at, all headings
+around are tried, and Gauss-Newton steps on all of them together end in the minima.
 """
 
 from dataclasses import dataclass
@@ -21,8 +21,8 @@ from estimators.trilateration import circle_intersections
 BLOCKED_LOSS = 2.8
 """Most that one range which is too long can cost: minus the logarithm of how much likelier a good one is.
 
-A good range of sigma 0.1 m has a density of 0.8 * 4.0 / m, one of a fifth that are blocked, with excesses up to
-a metre, about 0.2 / m: their ratio is 16.
+A good range of sigma 0.1 m has a density of 0.8 * 4.0 / m, one of a fifth that are blocked, with excesses
+up to a metre, about 0.2 / m: their ratio is 16.
 """
 SHORT_LIMIT = 3.0
 """Where the loss of a range that is too short goes on as a straight line [sigma]."""
@@ -77,7 +77,7 @@ def total_loss(placed: PlacedRanges, poses: FloatArray) -> FloatArray:
 
 
 def too_short(placed: PlacedRanges, pose: FloatArray) -> float:
-    """Share of ranges that are too short by more than `SHORT_LIMIT` if the way's frame stood at a pose (3,)."""
+    """Share of ranges too short by more than `SHORT_LIMIT` if the way's frame stood at a pose (3,)."""
     residuals, _ = _residuals(placed, pose[None])
     return float((residuals < -SHORT_LIMIT).mean())
 
@@ -126,7 +126,7 @@ def find_pose(placed: PlacedRanges, bias_sigma: float) -> Minimum | None:
 def _best_apart(poses: FloatArray, losses: FloatArray) -> FloatArray:
     """The poses of least loss, one of each place."""
     left = poses[np.argsort(losses, kind="stable")]
-    kept = []
+    kept: list[FloatArray] = []
     while len(left) and len(kept) < FINALISTS:
         kept.append(left[0])
         left = left[_is_elsewhere(left, left[0])]
@@ -144,7 +144,7 @@ def _descend(placed: PlacedRanges, poses: FloatArray, steps: tuple[float, ...]) 
     """Gauss-Newton steps on every pose (S, 3)."""
     for softening in steps:
         residuals, jacobian = _residuals(placed, poses)
-        information, gradient = _normal_equations(placed, residuals, jacobian, softening)
+        information, gradient = _normal_equations(residuals, jacobian, softening)
         information += 1e-6 * np.trace(information, axis1=1, axis2=2)[:, None, None] * np.eye(3)
         step = np.linalg.solve(information, gradient[:, :, None])[:, :, 0]
         poses = poses + np.clip(step, -LONGEST_STEP, LONGEST_STEP)
@@ -166,7 +166,7 @@ def _residuals(placed: PlacedRanges, poses: FloatArray) -> tuple[FloatArray, Flo
 
 
 def _normal_equations(
-    placed: PlacedRanges, residuals: FloatArray, jacobian: FloatArray, softening: float
+    residuals: FloatArray, jacobian: FloatArray, softening: float
 ) -> tuple[FloatArray, FloatArray]:
     """Information (S, 3, 3) and gradient (S, 3)."""
     soft = residuals / softening
@@ -210,9 +210,9 @@ def _covariance(
     A step's error moves all of the way behind it at once, a bias all ranges of an anchor: such errors do not
     average out, and the inverse of the information alone would leave them away.
 
-    Source: Huber, Robust Statistics, 1981, 6.3, covariance of an M-estimate under errors of another covariance.
+    Source: Huber, Robust Statistics, 1981, 6.3, covariance of an M-estimate under errors of any covariance.
     """
-    information, _ = _normal_equations(placed, residuals, jacobian, 1.0)
+    information, _ = _normal_equations(residuals, jacobian, 1.0)
     J = jacobian[0]
     weights = np.exp(-(np.maximum(residuals[0], 0.0) ** 2) / (2.0 * BLOCKED_LOSS))
     weighted = J * weights[:, None]

@@ -61,7 +61,10 @@ def test_every_shipped_site_loads() -> None:
             "anchors: all 3 anchors lie within 0.00 m of one line (at least 0.1 m is needed)",
         ),
         (("[site]", "[site"), "is not valid TOML"),
-        (("[start]", "[relocation]\nenabled = false\n[start]\nknown = false"), "relocation: enabled must be true"),
+        (
+            ("[start]", "[relocation]\nenabled = false\n[start]\nknown = false"),
+            "relocation: enabled must be true",
+        ),
     ],
 )
 def test_a_wrong_site_file_is_refused_in_one_line(change: tuple[str, str], said: str) -> None:

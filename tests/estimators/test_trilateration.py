@@ -156,8 +156,13 @@ def test_anchors_in_line_leave_two_positions_that_scipy_finds_from_either_side(c
     ranges = ranges_to(anchors, place) + rng.normal(0.0, sigmas)
     fixes = trilaterate(anchors, ranges, sigmas)
     assert len(fixes) == 2
+
+    def weighted(position: FloatArray) -> FloatArray:
+        residuals: FloatArray = (ranges_to(anchors, position) - ranges) / sigmas
+        return residuals
+
     for start in (place, mirrored(place, anchors[0], anchors[-1])):
-        reference = least_squares(lambda p: (ranges_to(anchors, p) - ranges) / sigmas, start)
+        reference = least_squares(weighted, start)
         assert min(np.linalg.norm(fix.position - reference.x) for fix in fixes) < 1e-4
     for fix in fixes:
         assert np.linalg.eigvalsh(fix.cov)[0] > 0.0

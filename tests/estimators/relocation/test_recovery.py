@@ -92,7 +92,8 @@ def test_bad_ranges_are_told_while_the_start_is_unknown() -> None:
 
 def test_anchors_nearly_in_line_are_no_ground_for_a_guess() -> None:
     in_line = replace(
-        ROOM, anchors={**with_anchors(1, 2).anchors, 5: np.array([4.0, 0.25, 2.0]), 6: np.array([6.0, 0.2, 2.0])}
+        ROOM,
+        anchors={**with_anchors(1, 2).anchors, 5: np.array([4.0, 0.25, 2.0]), 6: np.array([6.0, 0.2, 2.0])},
     )
     robot = Robot(in_line, 2)
     estimator = recovering("ekf", in_line)
@@ -110,7 +111,9 @@ def test_a_kidnapped_robot_is_found_again_within_five_seconds_of_motion(name: st
         estimator = recovering(name, known_start(ROOM, robot.pose))
         feed(estimator, robot.walk(6.0))
         assert reset_counter(estimator, robot) == 0
-        robot.carry_to(np.array([*(8.0 - robot.pose[:2])[::-1], robot.pose[2] + 2.0]) - [0.5, 0.5, 0.0], noticed)
+        robot.carry_to(
+            np.array([*(8.0 - robot.pose[:2])[::-1], robot.pose[2] + 2.0]) - [0.5, 0.5, 0.0], noticed
+        )
         feed(estimator, robot.walk(5.0))
         assert is_right(estimator, robot), f"seed {seed}: {error_of(estimator, robot)}"
         feed(estimator, robot.walk(3.0))
@@ -195,7 +198,7 @@ def test_one_of_three_anchors_blocked_for_good_leads_to_no_wrong_guess() -> None
 
 
 def written(pose: PoseEstimate | None) -> tuple[bytes, bytes, int] | None:
-    return pose and (pose.T_map_body.tobytes(), pose.cov.tobytes(), pose.reset_counter)
+    return None if pose is None else (pose.T_map_body.tobytes(), pose.cov.tobytes(), pose.reset_counter)
 
 
 @pytest.mark.parametrize("name", FILTERS)
@@ -237,7 +240,7 @@ def test_hostile_streams_get_verdicts_and_no_pose_that_is_no_number(
 
 def test_switched_off_the_start_mark_is_believed() -> None:
     robot = Robot(ROOM, 3)
-    wrong = known_start(ROOM, robot.pose + [0.0, 0.0, 1.2])
+    wrong = known_start(ROOM, robot.pose + np.array([0.0, 0.0, 1.2]))
     estimator = recovering("ekf", wrong, enabled=False)
     feed(estimator, robot.walk(8.0))
     assert reset_counter(estimator, robot) == 0

@@ -22,9 +22,7 @@ def window(length: float = 5.0) -> Window:
 
 def step(from_tenths: int, to_tenths: int, x: float, is_keyframe: bool) -> PoseIncrement:
     tenth = SECOND_NS // 10
-    return PoseIncrement(
-        from_tenths * tenth, to_tenths * tenth, np.array([x, 0.0, 0.0]), SMALL, is_keyframe
-    )
+    return PoseIncrement(from_tenths * tenth, to_tenths * tenth, np.array([x, 0.0, 0.0]), SMALL, is_keyframe)
 
 
 def founding(tenths: int) -> PoseIncrement:

@@ -1,4 +1,4 @@
-"""A robot that wanders about a room between anchors, with ranges that can be blocked, and can be carried off."""
+"""A robot that wanders about a room between anchors; its ranges can be blocked, and it can be carried off."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -97,7 +97,9 @@ class Robot:
     def _choose_turn(self) -> None:
         to_middle = np.array([4.0, 3.5]) - self.pose[:2]
         if np.linalg.norm(to_middle) > 1.8:
-            away = true_increment(np.zeros(3), np.array([0.0, 0.0, np.arctan2(*to_middle[::-1]) - self.pose[2]]))
+            away = true_increment(
+                np.zeros(3), np.array([0.0, 0.0, np.arctan2(*to_middle[::-1]) - self.pose[2]])
+            )
             self._turn = float(np.clip(2.0 * away[2], -1.0, 1.0))
         elif self._rng.random() < 0.1:
             self._turn = self._rng.uniform(-0.6, 0.6)
@@ -105,7 +107,9 @@ class Robot:
     def _increment(self) -> PoseIncrement:
         if self._founds:
             self._founds = False
-            measured = PoseIncrement(self.now_ns, self.now_ns, np.zeros(3), np.zeros((3, 3)), is_keyframe=True)
+            measured = PoseIncrement(
+                self.now_ns, self.now_ns, np.zeros(3), np.zeros((3, 3)), is_keyframe=True
+            )
         else:
             value = self._since_keyframe + self._rng.normal(0.0, INCREMENT_SIGMA)
             is_keyframe = (self.now_ns - self._keyframe_ns) >= SECOND_NS // 2
