@@ -4,11 +4,19 @@ import tomllib
 from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, Self, TypeVar
 
 import numpy as np
 import tomli_w
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model, field_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    create_model,
+    field_validator,
+    model_validator,
+)
 
 from companion.errors import UserError
 from drivers import SENSORS, sensor_config_class
@@ -18,10 +26,13 @@ from estimators import ESTIMATORS, estimator_config_class
 from estimators.base import Setup, Start
 from estimators.lidar.scan_matching import ScanMatcher
 from estimators.messages import FloatArray
+from estimators.relocation.recovery import Recovering
 from estimators.trilateration import AnchorGeometryError, check_anchor_geometry
 
 M = TypeVar("M", bound=BaseModel)
 Coordinate = Annotated[float, Field(ge=-10_000, le=10_000, allow_inf_nan=False)]
+UNKNOWN_START = Start(np.zeros(3), np.array([1e4, 1e4, np.pi]), known=False)
+"""As uncertain as coordinates can be, for whoever takes it for a pose all the same."""
 
 
 class Table(BaseModel):
@@ -64,14 +75,32 @@ class BodyTable(Table):
 class StartTable(Table):
     """Where the robot stands when the process starts, and how well that is known."""
 
-    x: Coordinate
-    y: Coordinate
-    yaw_deg: float = Field(ge=-360, le=360)
+    known: bool = Field(
+        True, description="false: the robot may stand anywhere, its pose is found once it has moved a metre"
+    )
+    x: Coordinate | None = Field(None, description="[m], map frame; needed when the start is known")
+    y: Coordinate | None = Field(None, description="likewise")
+    yaw_deg: float | None = Field(None, ge=-360, le=360, description="likewise [deg]")
     sigma_xy: float = Field(0.10, gt=0, le=100, description="[m], each axis")
     sigma_yaw_deg: float = Field(5.0, gt=0, le=180, description="[deg]")
     still_for: float = Field(
         5.0, ge=0, le=600, description="it stands there until LiDAR odometry begins, at most so long [s]"
     )
+
+    @model_validator(mode="after")
+    def _whole(self) -> Self:
+        for name in ("x", "y", "yaw_deg"):
+            if self.known and getattr(self, name) is None:
+                raise ValueError(f"{name} is required and missing (or set known = false)")
+        return self
+
+    def to_start(self) -> Start:
+        """The start in the form the estimators take it: metres and radians."""
+        if self.x is None or self.y is None or self.yaw_deg is None or not self.known:
+            return UNKNOWN_START
+        yaw, yaw_sigma = np.deg2rad([self.yaw_deg, self.sigma_yaw_deg])
+        pose = np.array([self.x, self.y, yaw])
+        return Start(pose, np.array([self.sigma_xy, self.sigma_xy, yaw_sigma]), self.still_for)
 
 
 class SensorTable(Table):
@@ -172,6 +201,7 @@ class Config(Table):
     estimator: Any = Field(
         default_factory=dict, validate_default=True, description="a table for each estimator, by name"
     )
+    relocation: Recovering.Config = Field(default_factory=Recovering.Config)
     health: HealthTable = Field(default_factory=HealthTable)
     mavlink: MavlinkTable = Field(default_factory=MavlinkTable)
 
@@ -194,6 +224,15 @@ class Config(Table):
                 raise ValueError(f"{name}.scan_likelihood needs a wall in site.walls")
         return tables
 
+    @field_validator("relocation")
+    @classmethod
+    def _finds_the_start(cls, relocation: Recovering.Config, info: Any) -> Recovering.Config:
+        if not relocation.enabled and "start" in info.data and not info.data["start"].known:
+            raise ValueError(
+                "enabled must be true to find the start, which start.known = false says is unknown"
+            )
+        return relocation
+
     def estimator_config(self, name: str) -> BaseModel:
         """Settings of the named estimator."""
         config = getattr(self.estimator, name)
@@ -202,16 +241,11 @@ class Config(Table):
 
     def setup(self) -> Setup:
         """Geometry in the form the estimators take it: metres and radians."""
-        start, body = self.start, self.body
-        yaw_sigma = np.deg2rad(start.sigma_yaw_deg)
+        body = self.body
         return Setup(
             anchors={i: np.array(position) for i, position in self.anchors.items()},
             tag_in_body=np.array(body.tag),
-            start=Start(
-                pose=np.array([start.x, start.y, np.deg2rad(start.yaw_deg)]),
-                sigma=np.array([start.sigma_xy, start.sigma_xy, yaw_sigma]),
-                still_for=start.still_for,
-            ),
+            start=self.start.to_start(),
             height=body.height,
             height_sigma=body.height_sigma,
             level_sigma=float(np.deg2rad(body.level_sigma_deg)),

@@ -25,6 +25,8 @@ from estimators import ESTIMATORS
 
 DEFAULT_CHOICES = (UWB_ALONE, LIDAR_ALONE, "ekf")
 NEES_CONFIDENCE = 0.95
+SETTLED_IN_TIME = 5.0
+"""A pose that had to be found is found in time within so much motion [s]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,6 +70,7 @@ class Evaluation:
         trials: how many.
         estimators: choice -> mean figures; None when it gave no pose at all in some trial.
         availability: choice -> share of the instants at which it gave a pose.
+        settled: choice -> `TrialFigures.settled_s` of each trial; empty unless a pose had to be found.
         paper: published figures of the scenario.
     """
 
@@ -75,12 +78,24 @@ class Evaluation:
     trials: int
     estimators: dict[str, MeanFigures | None]
     availability: dict[str, float]
+    settled: dict[str, list[float]]
     paper: PaperTable | None
 
     def to_json(self) -> dict[str, Any]:
         """The figures as plain data, in the layout that other programs rely on."""
         figures = {name: asdict(mean) if mean else None for name, mean in self.estimators.items()}
-        return {"scenario": self.scenario, "trials": self.trials, "estimators": figures}
+        data = {"scenario": self.scenario, "trials": self.trials, "estimators": figures}
+        if self.settled:
+            data["settled"] = {name: self.settled_figures(name) for name in self.settled}
+        return data
+
+    def settled_figures(self, name: str) -> dict[str, float | None]:
+        """In how many trials the pose was found in time, and the median time it took [s]; None: never."""
+        median = float(np.median(self.settled[name]))
+        return {
+            "within_5_s": sum(seconds <= SETTLED_IN_TIME for seconds in self.settled[name]),
+            "median_s": median if np.isfinite(median) else None,
+        }
 
 
 def evaluate_scenario(
@@ -120,6 +135,11 @@ def evaluate_scenario(
         availability={
             name: float(np.mean([f.availability if f else 0.0 for f in figures]))
             for name, figures in by_name.items()
+        },
+        settled={
+            name: [each.settled_s if each else np.inf for each in figures]
+            for name, figures in by_name.items()
+            if scenario.file.kidnap or not scenario.config.start.known
         },
         paper=scenario.file.paper,
     )

@@ -34,6 +34,13 @@ def evaluation_notes(result: Evaluation) -> list[str]:
         for name, share in result.availability.items()
         if share < 0.99
     ]
+    for name in result.settled:
+        found = result.settled_figures(name)
+        median = "never" if found["median_s"] is None else f"after {found['median_s']:.1f} s"
+        notes.append(
+            f"{name}: within 0.3 m and 10 deg to the end {median} (median); within 5 s of motion in "
+            f"{found['within_5_s']} of {result.trials} trials"
+        )
     return notes
 
 

@@ -77,12 +77,14 @@ class HealthMonitor:
         self._range_ns: int | None = None
         self._increment_ns: int | None = None
         self._begin_ns: int | None = None
+        self._note = ""
 
     def observe(self, measurement: Measurement, report: Report) -> None:
         """Take note of what the estimator made of a measurement."""
         stamp_ns = measurement_stamp_ns(measurement)
         if self._begin_ns is None:
             self._begin_ns = stamp_ns
+        self._note = report.note
         good = sum(verdict is Verdict.ACCEPTED for verdict in report.verdicts)
         if isinstance(measurement, PoseIncrement):
             if good and measurement.from_stamp_ns < measurement.stamp_ns:
@@ -124,13 +126,13 @@ class HealthMonitor:
         """State at `now_ns` for the pose that would be sent."""
         table = self._table
         if pose is None:
-            return Health(State.STARTING, "no pose yet: waiting for measurements")
+            return Health(State.STARTING, self._note or "no pose yet: waiting for measurements")
         sources = self._sources(now_ns)
         awaited = [s.what for s in sources if s.first_awaited and not s.is_stale]
         if awaited:
             return Health(State.STARTING, f"waiting for the first {awaited[0]}")
         if np.isposinf(pose.cov[5, 5]):
-            return Health(State.LOST, "heading not known: start again on the start mark")
+            return Health(State.LOST, f"heading not known: {self._note or 'start again on the start mark'}")
         if not (np.isfinite(pose.T_map_body).all() and np.isfinite(pose.cov).all()):
             return Health(State.LOST, "pose or covariance is not finite")
         if np.linalg.eigvalsh(pose.cov)[0] <= 0.0:

@@ -144,7 +144,9 @@ def make_parts(config: Config, names: list[str]) -> tuple[FrontEnd, dict[str, Es
     """Front end and the named estimators with the site's settings."""
     setup = config.setup()
     front_end = ScanMatcher(config.scan_matcher, config.lidar_mounting())
-    return front_end, {name: make_estimator(name, config.estimator_config(name), setup) for name in names}
+    return front_end, {
+        name: make_estimator(name, config.estimator_config(name), setup, config.relocation) for name in names
+    }
 
 
 def make_pipeline(config: Config, names: list[str]) -> Pipeline:

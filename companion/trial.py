@@ -24,6 +24,11 @@ from estimators.messages import Measurement, PoseEstimate
 UWB_ALONE, LIDAR_ALONE = "uwb_ls", "lidar"
 """The single sensors: `least_squares` on ranges alone; increments added up from the true start."""
 
+RIGHT_WITHIN = (0.3, np.deg2rad(10.0))
+"""Horizontal distance [m] and heading error [rad] within which a pose that was looked for is found."""
+MOVED = 0.01
+"""A robot that is further than this [m] from where it stood has set off."""
+
 
 @dataclass(frozen=True, slots=True)
 class TrialFigures:
@@ -39,6 +44,8 @@ class TrialFigures:
         availability: share of the instants at which there was a pose.
         update_us: median and 99th percentile of the time of an update that was used [us].
         bound_ratio: `rmse_m` over the posterior Cramer-Rao bound; None when that is not known.
+        settled_s: time from the first motion, or from the last kidnapping, until the pose stays within
+            `RIGHT_WITHIN` to the end [s]; infinite when it does not, or has no heading.
     """
 
     rmse_m: float
@@ -54,6 +61,7 @@ class TrialFigures:
     availability: float
     update_us: tuple[float, float]
     bound_ratio: float | None
+    settled_s: float
 
 
 def run_trial(
@@ -86,8 +94,9 @@ def run_trial(
         truths, instants = _run_chain(scenario, timed, poses)
     reference = Reference(truths)
     covered = sum(reference.covers(stamp_ns) for stamp_ns in instants)
+    sought_ns = _sought_since(truths, kidnapped=bool(scenario.file.kidnap))
     return {
-        choice: _figures(compare(poses[choice], reference, covered), timed[choice].seconds, bound)
+        choice: _figures(compare(poses[choice], reference, covered), timed[choice].seconds, bound, sought_ns)
         for choice in choices
     }
 
@@ -120,7 +129,7 @@ def _make(scenario: Scenario, setup: Setup, choice: str) -> Estimator:
     if choice == UWB_ALONE:
         choice = "least_squares"
     settings = chosen_settings(scenario.config, choice, "--estimators")
-    return make_estimator(split_choice(choice)[0], settings, setup)
+    return make_estimator(split_choice(choice)[0], settings, setup, scenario.config.relocation)
 
 
 def _step_through(
@@ -167,9 +176,11 @@ def _note(now: Mapping[str, PoseEstimate | None], poses: Mapping[str, list[PoseE
 def _bound(scenario: Scenario, setup: Setup, walk: MeasuredWalk) -> float | None:
     """Root mean square over the walk of the least position error [m]; blocked ranges do not count.
 
-    None when ranges or landmarks are measured between the steps, where no increment tells the motion, or
-    without noise.
+    None when ranges or landmarks are measured between the steps, where no increment tells the motion,
+    without noise, and where the start is unknown or the robot is carried off.
     """
+    if scenario.file.kidnap or not setup.start.known:
+        return None
     step_of = {stamp_ns: k for k, stamp_ns in enumerate(walk.stamps_ns.tolist())}
     measured_at = {frame.stamp_ns for frame in walk.range_frames}
     measured_at |= {look.stamp_ns for look in walk.landmark_frames}
@@ -190,7 +201,27 @@ def _bound(scenario: Scenario, setup: Setup, walk: MeasuredWalk) -> float | None
     return float(np.sqrt((bounds[:, 0, 0] + bounds[:, 1, 1]).mean()))
 
 
-def _figures(errors: Errors, seconds: list[float], bound: float | None) -> TrialFigures | None:
+def _sought_since(truths: Sequence[Truth], kidnapped: bool) -> int:
+    """When the robot set off, or was carried off for the last time."""
+    xy = np.array([truth.pose[:2] for truth in truths])
+    if kidnapped:
+        return truths[1 + int(np.argmax(np.linalg.norm(np.diff(xy, axis=0), axis=1)))].stamp_ns
+    return truths[int(np.argmax(np.linalg.norm(xy - xy[0], axis=1) > MOVED))].stamp_ns
+
+
+def _settled(errors: Errors, since_ns: int) -> float:
+    if not errors.has_yaw:
+        return np.inf
+    wrong = (errors.distance > RIGHT_WITHIN[0]) | (np.abs(errors.error[:, 2]) > RIGHT_WITHIN[1])
+    right_from = 1 + int(np.flatnonzero(wrong)[-1]) if wrong.any() else 0
+    if right_from == len(wrong):
+        return np.inf
+    return max(0.0, float(errors.stamps_ns[right_from] - since_ns) * 1e-9)
+
+
+def _figures(
+    errors: Errors, seconds: list[float], bound: float | None, sought_ns: int
+) -> TrialFigures | None:
     accuracy = errors.accuracy()
     if accuracy is None:
         return None
@@ -212,4 +243,5 @@ def _figures(errors: Errors, seconds: list[float], bound: float | None) -> Trial
         availability=accuracy.availability,
         update_us=(median, p99),
         bound_ratio=accuracy.rmse / bound if bound is not None else None,
+        settled_s=_settled(errors, sought_ns),
     )

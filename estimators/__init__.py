@@ -5,7 +5,7 @@ from typing import Any, cast
 
 from pydantic import BaseModel
 
-from estimators.base import Estimator, Setup
+from estimators.base import Estimator, Settable, Setup
 
 ESTIMATORS: dict[str, tuple[str, str]] = {
     "ekf": ("estimators.ekf", "Ekf"),
@@ -32,12 +32,27 @@ def estimator_config_class(name: str) -> type[BaseModel]:
     return cast("type[BaseModel]", _estimator_class(name).Config)
 
 
-def make_estimator(name: str, config: BaseModel, setup: Setup) -> Estimator:
+def make_estimator(
+    name: str, config: BaseModel, setup: Setup, relocation: BaseModel | None = None
+) -> Estimator:
     """New estimator of the given name.
 
     Args:
         name: a key of `ESTIMATORS`.
         config: instance of its `Config`.
         setup: geometry of the site.
+        relocation: settings of `Recovering`, with which a filter on ranges finds its start and itself again;
+            None to believe the start.
     """
-    return cast("Estimator", _estimator_class(name)(config, setup))
+    from estimators.range_gate import RangeGate
+    from estimators.relocation.recovery import Recovering
+
+    estimator = cast("Estimator", _estimator_class(name)(config, setup))
+    if (
+        isinstance(relocation, Recovering.Config)
+        and relocation.enabled
+        and isinstance(estimator, Settable)
+        and isinstance(config, RangeGate.Config)
+    ):
+        return Recovering(estimator, relocation, RangeGate(config, setup), setup)
+    return estimator

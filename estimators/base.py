@@ -27,6 +27,10 @@ class Verdict(StrEnum):
     """The increment starts at a pose that the estimator does not hold."""
     LATE = "late"
     """Older than what was already processed."""
+    WAITING = "waiting"
+    """The pose is not known yet; the measurement is kept for finding it."""
+    AMBIGUOUS = "ambiguous"
+    """The usable anchors of the frame are too few or in line, and two positions fit alike."""
     NOT_USED = "not used"
     """This estimator has no use for such a measurement."""
 
@@ -42,11 +46,13 @@ class Report:
         verdicts: one per range of a RangeFrame, else one.
         residuals: like `verdicts`; measured minus predicted [m] for ranges, NaN where there is none.
         nis: like `verdicts`; normalised innovation squared, NaN where there is none.
+        note: what the estimator lacks for a pose, for the operator; empty when it has one.
     """
 
     verdicts: tuple[Verdict, ...]
     residuals: FloatArray = field(default_factory=lambda: _EMPTY)
     nis: FloatArray = field(default_factory=lambda: _EMPTY)
+    note: str = ""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,11 +63,13 @@ class Start:
         pose: (3,) x [m], y [m], yaw [rad] of the body in the map.
         sigma: (3,) standard deviations of the same.
         still_for: the robot stands there until odometry begins, at most this long [s].
+        known: False when the robot may stand anywhere and the pose must be found; `pose` means nothing then.
     """
 
     pose: FloatArray
     sigma: FloatArray
     still_for: float = 0.0
+    known: bool = True
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,7 +1,10 @@
 """UWB alone, frame by frame: the position a tag has without memory, motion model or LiDAR."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
+from scipy.stats import chi2
 
 from estimators.base import Report, Setup, Verdict
 from estimators.geometry import lift
@@ -9,11 +12,16 @@ from estimators.messages import FloatArray, Measurement, PoseEstimate, RangeFram
 from estimators.models.range import reduce_height
 from estimators.trilateration import AnchorGeometryError, Fix, trilaterate
 
+REACHED = float(chi2.ppf(0.997, 2))
+"""NIS of a step from the last fix to this one, up to which the tag can have made it."""
+
 
 class LeastSquares:
     """Weighted least-squares position of every range frame.
 
-    It knows no heading, so the body is taken to be at the tag and the lever arm enters the covariance.
+    Where two positions fit alike, as with two anchors or with several in line, it takes the one that the last
+    fix leaves possible, or none. It knows no heading, so the body is taken to be at the tag and the lever arm
+    enters the covariance.
 
     Source: huang2024 Eq. (3)-(4); li2022 "least squares".
     """
@@ -67,19 +75,39 @@ class LeastSquares:
             rows.append((anchor[:2], *reduced))
         residuals = np.full(len(verdicts), np.nan)
         try:
-            fix = trilaterate(
+            fixes = trilaterate(
                 np.array([row[0] for row in rows]).reshape(-1, 2),
                 np.array([row[1] for row in rows]),
                 np.array([row[2] for row in rows]),
             )
+            refusal = Verdict.AMBIGUOUS
         except AnchorGeometryError:
+            fixes, refusal = (), Verdict.TOO_FEW
+        fix = fixes[0] if len(fixes) == 1 else self._reached(fixes, measurement.stamp_ns)
+        if fix is None:
             for i in used:
-                verdicts[i] = Verdict.TOO_FEW
+                verdicts[i] = refusal
             return Report(tuple(verdicts), residuals, residuals)
         residuals[used] = fix.residuals
         self._fix = fix
         self._fix_ns = measurement.stamp_ns
         return Report(tuple(verdicts), residuals, np.full(len(verdicts), np.nan))
+
+    def _reached(self, fixes: Sequence[Fix], stamp_ns: int) -> Fix | None:
+        """The only one of several positions to which the tag can have come from the last fix."""
+        if self._fix is None:
+            return None
+        age = (stamp_ns - self._fix_ns) * 1e-9
+        if age > self._config.max_age:
+            return None
+        moved = (self._config.speed_sigma * age) ** 2 * np.eye(2)
+        near = []
+        for fix in fixes:
+            step = fix.position - self._fix.position
+            nis = float(step @ np.linalg.solve(fix.cov + self._fix.cov + moved, step))
+            if nis < REACHED:
+                near.append(fix)
+        return near[0] if len(near) == 1 else None
 
     def pose_at(self, stamp_ns: int) -> PoseEstimate | None:
         """The last fix, held; its covariance grows with its age. Yaw variance is infinite."""

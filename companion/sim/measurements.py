@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from companion.sim.ranging import draw_ranging
+from companion.sim.ranging import draw_delay_biases, draw_ranging
 from companion.sim.scenario import Scenario
-from companion.sim.scenario_tables import IncrementsTable, LandmarksTable
+from companion.sim.scenario_tables import IncrementsTable, KidnapTable, LandmarksTable
 from companion.sim.simulate import START_NS
 from estimators.base import Setup
 from estimators.geometry import between, rotation, transform_each, wrap_angle, wrap_angles
@@ -68,7 +68,7 @@ def measure(scenario: Scenario) -> MeasuredWalk:
     return MeasuredWalk(
         stamps_ns=stamps_ns,
         poses=poses,
-        increments=_increments(odometry, odometry_rng, stamps_ns, poses),
+        increments=_increments(odometry, odometry_rng, stamps_ns, poses, scenario.file.kidnap),
         range_frames=range_frames,
         unblocked=unblocked,
         landmark_frames=_landmark_frames(scenario, landmarks, landmark_rng) if landmarks else [],
@@ -84,7 +84,11 @@ def _instants(scenario: Scenario, rate: float) -> tuple[IntArray, FloatArray]:
 
 
 def _increments(
-    table: IncrementsTable, rng: np.random.Generator, stamps_ns: IntArray, poses: FloatArray
+    table: IncrementsTable,
+    rng: np.random.Generator,
+    stamps_ns: IntArray,
+    poses: FloatArray,
+    kidnaps: list[KidnapTable],
 ) -> list[PoseIncrement]:
     """Increments from each pose to the next.
 
@@ -100,8 +104,14 @@ def _increments(
         PoseIncrement(int(stamps_ns[0]), int(stamps_ns[0]), np.zeros(3), np.zeros((3, 3)), is_keyframe=True)
     ]
     for k, step_noise in enumerate(noise):
+        from_ns, to_ns = stamps_ns[k : k + 2].tolist()
+        carried = [kidnap for kidnap in kidnaps if from_ns < START_NS + round(kidnap.at * 1e9) <= to_ns]
+        if any(kidnap.noticed for kidnap in carried):
+            increments.append(PoseIncrement(to_ns, to_ns, np.zeros(3), np.zeros((3, 3)), is_keyframe=True))
+            continue
         R_body_map = rotation(poses[k, 2]).T
-        step = between(poses[k], poses[k + 1])
+        # A step lasts a tenth of a second: as if the robot had stood while it was carried unnoticed.
+        step = np.zeros(3) if carried else between(poses[k], poses[k + 1])
         length = float(np.hypot(step[0], step[1]))
         value = step * [1.0 + scale, 1.0 + scale, 1.0]
         value[:2] += R_body_map @ step_noise[:2]
@@ -111,7 +121,6 @@ def _increments(
             step[:2], step[:2]
         )
         cov[2, 2] = sigma_yaw**2 + (drift_sigma * length) ** 2
-        from_ns, to_ns = stamps_ns[k : k + 2].tolist()
         increments.append(PoseIncrement(from_ns, to_ns, value, cov, is_keyframe=True))
     return increments
 
@@ -127,6 +136,7 @@ def _range_frames(scenario: Scenario, rng: np.random.Generator) -> tuple[list[Ra
     tags = np.column_stack([transform_each(poses, lever_arm[None, :2]), tag_height])
     clear = np.array([world.line_of_sight(tag, anchors) for tag in tags])
     distances = np.linalg.norm(anchors - tags[:, None], axis=2)
+    distances += draw_delay_biases(uwb, len(ids), rng)
     drawn = draw_ranging(uwb, distances, clear, rng)
     frames = [
         RangeFrame(

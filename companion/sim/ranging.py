@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from companion.sim.scenario import UwbTable
 from estimators.messages import FloatArray
+from estimators.models.range import two_way_range
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -24,6 +25,21 @@ class Ranging:
     received: NDArray[np.bool_]
     rx_power: FloatArray
     fp_power: FloatArray
+
+
+def draw_delay_biases(uwb: UwbTable, count: int, rng: np.random.Generator) -> FloatArray:
+    """What ranges of each anchor err by, (count,) [m], when it answers later or sooner than the tag believes.
+
+    Args:
+        uwb: how well the delays are known.
+        count: number of anchors.
+        rng: source of noise; nothing is drawn when the delays are known.
+    """
+    if uwb.delay_sigma_ns == 0.0:
+        return np.zeros(count)
+    late = 1e-9 * uwb.delay_sigma_ns * rng.standard_normal(count)
+    none = np.zeros(count)
+    return two_way_range(none, late, none, none)
 
 
 def draw_ranging(

@@ -2,21 +2,24 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Self
 
 import numpy as np
-from pydantic import Field, ValidationInfo, field_validator
+from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from companion.config import Config, Coordinate, Table, known, load_config, parse_toml, read_text, validated
 from companion.errors import UserError
 from companion.sim.gait import GaitTrajectory
+from companion.sim.kidnap import Kidnapped, Walk
 from companion.sim.lidar_models import LIDAR_MODELS
 from companion.sim.scenario_tables import (
     GaitTable,
     IncrementsTable,
+    KidnapTable,
     LandmarksTable,
     PaperTable,
     RandomBoxesTable,
+    RandomWaypointsTable,
 )
 from companion.sim.trajectory import Trajectory
 from companion.sim.world import World
@@ -41,12 +44,21 @@ class WorldTable(Table):
 class TrajectoryTable(Table):
     """Where the robot walks."""
 
-    waypoints: list[tuple[Coordinate, Coordinate]] = Field(min_length=2)
+    waypoints: list[tuple[Coordinate, Coordinate]] = Field([], description="corners [m], map frame")
+    random: RandomWaypointsTable | None = Field(None, description="corners of each trial, in place of these")
     laps: int = Field(1, ge=0, le=1000, description="times round the closed path; 0: open path")
     speed: float = Field(0.5, gt=0, le=10, description="[m/s]")
     accel: float = Field(0.5, gt=0, le=20, description="[m/s^2]")
     turn_rate_deg: float = Field(60.0, gt=0, le=360, description="[deg/s]")
     rest: float = Field(2.0, ge=0, le=600, description="standing still before and after [s]")
+
+    @model_validator(mode="after")
+    def _one_way(self) -> Self:
+        if self.random is None and len(self.waypoints) < 2:
+            raise ValueError(f"waypoints: at least 2 are needed, got {len(self.waypoints)}")
+        if self.random is not None and self.waypoints:
+            raise ValueError("random: waypoints are given, too; leave one out")
+        return self
 
 
 class UwbTable(Table):
@@ -66,6 +78,9 @@ class UwbTable(Table):
     other_traffic: bool = Field(False, description="user data, text and complaints on the same port")
     rate: float = Field(25.0, ge=1, le=200, description="frames a second [Hz]")
     sigma: float = Field(0.10, ge=0, le=5, description="standard deviation of a range [m]")
+    delay_sigma_ns: float = Field(
+        0.0, ge=0, le=100, description="how little each anchor's answering delay is known; 1 ns is 15 cm [ns]"
+    )
     nlos_least: float = Field(0.2, ge=0, le=10, description="least bias of a blocked range [m]")
     nlos_mean: float = Field(0.3, ge=0, le=10, description="mean of the exponential bias on top of that [m]")
     dropout: float = Field(0.02, ge=0, lt=1, description="share of ranges that fail")
@@ -125,6 +140,7 @@ class ScenarioFile(Table):
     lidar: LidarTable = Field(default_factory=LidarTable)
     imu: ImuTable = Field(default_factory=ImuTable)
     faults: list[FaultTable] = Field(default_factory=list)
+    kidnap: list[KidnapTable] = Field(default_factory=list)
     gait: GaitTable | None = None
     increments: IncrementsTable | None = None
     landmarks: LandmarksTable | None = None
@@ -148,7 +164,7 @@ class Scenario:
         config: the site's configuration.
         seed: of everything random in it.
         world: walls and boxes.
-        trajectory: the true walk, its start displaced as the site's start sigma says.
+        trajectory: the true walk; its start is displaced as the site's start sigma says, if it is known.
         rng: where the sensors draw their noise from.
     """
 
@@ -157,7 +173,7 @@ class Scenario:
     config: Config
     seed: int
     world: World
-    trajectory: Trajectory | GaitTrajectory
+    trajectory: Walk
     rng: np.random.Generator
 
 
@@ -191,9 +207,9 @@ def load_scenario(path: Path, seed: int | None, sets: list[str]) -> Scenario:
     rng = np.random.default_rng(seed)
     boxes = [(*b.centre, *b.size, float(np.deg2rad(b.yaw_deg)), b.height) for b in file.world.boxes]
     # The operator sets the robot down on its mark as well as the site file says, not better.
-    placement = rng.standard_normal(3) * start.sigma
+    placement = rng.standard_normal(3) * start.sigma if start.known else np.zeros(3)
     straight = Trajectory(
-        walk.waypoints,
+        walk.random.draw(rng) if walk.random else walk.waypoints,
         walk.laps,
         walk.speed,
         walk.accel,
@@ -203,13 +219,22 @@ def load_scenario(path: Path, seed: int | None, sets: list[str]) -> Scenario:
     )
     for table in file.world.random_boxes:
         boxes += table.draw(rng)
-    trajectory = GaitTrajectory(straight, walk.rest, file.gait, rng) if file.gait else straight
-    if not np.allclose(trajectory.start, start.pose, atol=1e-3):
+    trajectory: Walk = GaitTrajectory(straight, walk.rest, file.gait, rng) if file.gait else straight
+    if start.known and walk.random:
+        raise UserError(
+            f"{path}: random waypoints start anywhere: the site needs start.known = false (--set)"
+        )
+    if start.known and not np.allclose(trajectory.start, start.pose, atol=1e-3):
         x, y, yaw = trajectory.start
         raise UserError(
             f"{path}: the walk begins at ({x:g}, {y:g}) facing {np.rad2deg(yaw):g} deg, but the site's "
             f"[start] is ({start.pose[0]:g}, {start.pose[1]:g}), {np.rad2deg(start.pose[2]):g} deg"
         )
+    for i, kidnap in enumerate(file.kidnap):
+        try:
+            trajectory = Kidnapped(trajectory, kidnap, rng)
+        except ValueError as error:
+            raise UserError(f"{path}: kidnap.{i}: {error}") from error
     return Scenario(
         name=path.stem,
         file=file,

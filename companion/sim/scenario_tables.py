@@ -46,6 +46,55 @@ class RandomBoxesTable(Table):
         ]
 
 
+class RandomWaypointsTable(Table):
+    """Corners that lie somewhere else in every trial, and with them the start and its heading."""
+
+    count: int = Field(ge=2, le=1000)
+    x: Interval = Field(description="least and greatest x of a corner [m], map frame")
+    y: Interval = Field(description="the same for y [m]")
+    least_leg: float = Field(1.0, ge=0, le=100, description="least length of a leg [m]")
+
+    @model_validator(mode="after")
+    def _room_for_a_leg(self) -> Self:
+        room = float(np.hypot(self.x[1] - self.x[0], self.y[1] - self.y[0]))
+        if self.x[0] > self.x[1] or self.y[0] > self.y[1] or room < 2.0 * self.least_leg:
+            raise ValueError(
+                f"least_leg: x and y must leave room for legs twice as long as {self.least_leg:g} m, "
+                f"their diagonal is {room:g} m"
+            )
+        return self
+
+    def draw(self, rng: np.random.Generator) -> list[tuple[float, float]]:
+        """Corners (x, y) [m] of one trial."""
+        corners: list[tuple[float, float]] = []
+        while len(corners) < self.count:
+            corner = rng.uniform(*self.x), rng.uniform(*self.y)
+            if not corners or np.hypot(*np.subtract(corner, corners[-1])) >= self.least_leg:
+                corners.append(corner)
+        return corners
+
+
+class KidnapTable(Table):
+    """The robot is picked up and set down elsewhere, in an instant; then it walks on as if nothing had been.
+
+    Scans show it. In a scenario with `[increments]` the odometry either notices and begins anew, or not.
+    """
+
+    at: float = Field(gt=0, description="since the walk began [s]")
+    to: tuple[Coordinate, Coordinate, float] | None = Field(
+        None, description="x [m], y [m], yaw [deg] where it is set down; without: anywhere"
+    )
+    x: Interval | None = Field(None, description="without `to`: the rest of the walk stays between [m]")
+    y: Interval | None = Field(None, description="the same for y [m]")
+    noticed: bool = Field(True, description="whether an odometry of `[increments]` begins anew")
+
+    @model_validator(mode="after")
+    def _somewhere(self) -> Self:
+        if self.to is None and (self.x is None or self.y is None):
+            raise ValueError("to: give a pose, or x and y between which to draw one")
+        return self
+
+
 class GaitTable(Table):
     """How a legged robot's body moves about its straight way while it walks; its phase is random."""
 

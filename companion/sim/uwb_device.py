@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from companion.sim.ranging import draw_delay_biases
 from companion.sim.robot import Robot
 from companion.sim.scenario import ImuTable, UwbTable
 from companion.sim.trajectory import Motion
@@ -68,6 +69,7 @@ class LinkTrackDevice:
         config = robot.scenario.config
         self._anchor_ids = list(config.anchors)
         self._anchors = np.array(list(config.anchors.values()))
+        self._biases = draw_delay_biases(self._uwb, len(self._anchor_ids), rng)
         self._tag = np.array(config.body.tag)
         self._height = config.body.height
         self._gyro_bias = rng.standard_normal(3) * self._imu.gyro_bias
@@ -207,7 +209,7 @@ class LinkTrackDevice:
     def _ranges(self, pose: FloatArray) -> tuple[NodeRange, ...]:
         tag = np.array([*transform(pose, self._tag[None, :2])[0], self._height + self._tag[2]])
         clear = self._robot.scenario.world.line_of_sight(tag, self._anchors)
-        distances = np.linalg.norm(self._anchors - tag, axis=1)
+        distances = np.linalg.norm(self._anchors - tag, axis=1) + self._biases
         noise = self._rng.standard_normal(len(distances)) * self._uwb.sigma
         excess = self._uwb.nlos_least + self._rng.exponential(self._uwb.nlos_mean, len(distances))
         failed = self._rng.random(len(distances)) < self._uwb.dropout

@@ -43,7 +43,7 @@ def test_every_shipped_site_loads() -> None:
     [
         (("height = 0.30", "hieght = 0.30"), "body.hieght: unknown key"),
         (("x = 1.5", "x = nan"), "start.x: Input should be a finite number, got nan"),
-        (("x = 1.5\n", ""), "start.x: this key is required and missing"),
+        (("x = 1.5\n", ""), "start: x is required and missing (or set known = false)"),
         (("sigma_xy = 0.05", "sigma_xy = -1"), "start.sigma_xy: Input should be greater than 0, got -1"),
         (("2.2]", '"high"]'), "anchors.0.2: Input should be a valid number"),
         (('driver = "rplidar"', 'driver = "velodyne"'), "there are: linktrack, rplidar"),
@@ -61,6 +61,10 @@ def test_every_shipped_site_loads() -> None:
             "anchors: all 3 anchors lie within 0.00 m of one line (at least 0.1 m is needed)",
         ),
         (("[site]", "[site"), "is not valid TOML"),
+        (
+            ("[start]", "[relocation]\nenabled = false\n[start]\nknown = false"),
+            "relocation: enabled must be true",
+        ),
     ],
 )
 def test_a_wrong_site_file_is_refused_in_one_line(change: tuple[str, str], said: str) -> None:
@@ -70,6 +74,15 @@ def test_a_wrong_site_file_is_refused_in_one_line(change: tuple[str, str], said:
     assert said in str(caught.value)
     assert str(caught.value).startswith("site.toml")
     assert "\n" not in str(caught.value)
+
+
+def test_a_start_that_is_unknown_needs_no_pose() -> None:
+    config = load_config(SITE, ["start.known=false"])
+    assert not config.setup().start.known
+    a, b = SITE_TEXT.index("x = 1.5"), SITE_TEXT.index("sigma_xy")
+    without = config_from_toml(SITE_TEXT[:a] + "known = false\n" + SITE_TEXT[b:], "site.toml")
+    assert not without.setup().start.known
+    assert config_from_toml(without.to_toml(), "again") == without
 
 
 def test_set_changes_one_setting() -> None:

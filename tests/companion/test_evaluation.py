@@ -14,6 +14,7 @@ import pytest
 from companion.config import params_dir
 from companion.errors import UserError
 from companion.evaluation import Evaluation, evaluate_scenario, nees_bounds
+from companion.evaluation_table import evaluation_notes
 from companion.log import Log
 from companion.replay import config_of, replay
 from companion.sim.scenario import load_scenario
@@ -185,6 +186,45 @@ def test_an_ordinary_scenario_goes_through_the_whole_chain_as_in_a_replay(tmp_pa
     lidar = trial["lidar"]
     assert lidar is not None
     assert lidar.rmse_m < 0.05
+
+
+UNKNOWN = ["start.known=false"]
+
+
+def test_a_pose_that_had_to_be_found_is_told_of_with_the_time_it_took(tmp_path: Path) -> None:
+    path = write_scenario(tmp_path, more=FEW)
+    result = evaluate_scenario(path, 2, choices=["ekf", "uwb_ls"], sets=UNKNOWN)
+    assert all(0.5 < seconds < 5.0 for seconds in result.settled["ekf"])
+    assert result.to_json()["settled"] == {
+        "ekf": {"within_5_s": 2, "median_s": pytest.approx(np.median(result.settled["ekf"]))},
+        "uwb_ls": {"within_5_s": 0, "median_s": None},
+    }
+    figures = result.estimators["ekf"]
+    assert figures is not None
+    assert figures.bound_ratio is None
+    assert figures.rmse_m < 0.15
+    assert any(note.startswith("ekf: within 0.3 m and 10 deg") for note in evaluation_notes(result))
+    assert "uwb_ls: within 0.3 m and 10 deg to the end never" in " ".join(evaluation_notes(result))
+    assert evaluate_scenario(path, 1, choices=["ekf"]).settled == {}
+
+
+def test_time_to_be_found_counts_from_the_kidnapping(tmp_path: Path) -> None:
+    kidnap = "[[kidnap]]\nat = 3.0\nto = [4.0, 4.0, 90.0]\n"
+    path = write_scenario(tmp_path, more=kidnap + FEW)
+    found = run_trial(path, 1, [], ["ekf"])["ekf"]
+    given_up = run_trial(path, 1, ["relocation.enabled=false"], ["ekf"])["ekf"]
+    assert found is not None
+    assert given_up is not None
+    assert 0.5 < found.settled_s < 5.0
+    assert given_up.settled_s > 5.0
+
+
+def test_an_unknown_start_is_found_through_the_whole_chain(tmp_path: Path) -> None:
+    figures = run_trial(write_scenario(tmp_path), 2, UNKNOWN, ["ekf"])["ekf"]
+    assert figures is not None
+    assert figures.settled_s < 5.0
+    assert 0.4 < figures.availability < 0.95
+    assert figures.rmse_m < 0.15
 
 
 def test_an_estimator_without_any_pose_has_no_figures(tmp_path: Path) -> None:

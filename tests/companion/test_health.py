@@ -157,3 +157,20 @@ def test_an_unknown_heading_is_named() -> None:
     health = monitor_at(5.0).judge(pose(cov), 5 * SECOND)
     assert (health.state, health.sends) == (State.LOST, False)
     assert "heading not known" in health.reason
+
+
+def test_what_an_estimator_lacks_is_told_to_the_operator() -> None:
+    monitor = monitor_at(5.0)
+    assert monitor.judge(None, 5 * SECOND).reason == "no pose yet: waiting for measurements"
+    lost = np.eye(6) * 0.01
+    lost[5, 5] = np.inf
+    assert monitor.judge(pose(lost), 5 * SECOND).reason.endswith("start again on the start mark")
+    monitor.observe(ranges(5 * SECOND), Report((Verdict.WAITING,) * 4, note="looking for the pose: drive"))
+    assert monitor.judge(None, 5 * SECOND).reason == "looking for the pose: drive"
+    health = monitor.judge(pose(lost), 5 * SECOND)
+    assert (health.state, health.reason) == (
+        State.LOST,
+        "heading not known: looking for the pose: drive",
+    )
+    monitor.observe(ranges(5 * SECOND), Report((Verdict.ACCEPTED,) * 4))
+    assert monitor.judge(None, 5 * SECOND).reason == "no pose yet: waiting for measurements"

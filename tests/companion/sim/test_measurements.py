@@ -151,6 +151,22 @@ def test_blocked_ranges_lose_most_on_their_first_path(tmp_path: Path) -> None:
     assert max(gaps[True]) < min(gaps[False])
 
 
+def test_a_delay_that_is_not_known_is_a_bias_of_each_anchor_for_the_whole_trial(tmp_path: Path) -> None:
+    uwb = "[uwb]\nsigma = 1e-4\nnlos_least = 0\nnlos_mean = 0\ndropout = 0\n"
+    biases = []
+    for seed in range(12):
+        known, unknown = (
+            walked(tmp_path, INCREMENTS + uwb + delay, seed) for delay in ("", "delay_sigma_ns = 1.0\n")
+        )
+        off = np.array(
+            [b.ranges - a.ranges for a, b in zip(known.range_frames, unknown.range_frames, strict=True)]
+        )
+        assert off.std(axis=0).max() < 1e-3
+        biases.append(off.mean(axis=0))
+    # Draws of half of what light travels in a nanosecond.
+    assert np.std(biases) == pytest.approx(0.1499, rel=0.35)
+
+
 def test_landmarks_are_seen_with_the_stated_noise_as_far_as_stated(tmp_path: Path) -> None:
     errors, hidden = [], 0
     for seed in range(10):

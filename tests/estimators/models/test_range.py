@@ -6,7 +6,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from estimators.messages import FloatArray
-from estimators.models.range import MIN_HORIZONTAL_RANGE, horizontal_range, reduce_height
+from estimators.models.range import MIN_HORIZONTAL_RANGE, horizontal_range, reduce_height, two_way_range
 from tests.estimators.models.finite_differences import numerical_jacobian
 from tests.strategies import poses
 
@@ -87,3 +87,13 @@ def test_on_top_of_the_anchor_value_and_jacobian_are_finite() -> None:
     value, jacobian = horizontal_range(np.array([1.0, 2.0, 0.0]), np.array([1.0, 2.0, 2.5]), np.zeros(3))
     assert value < 1e-6
     assert np.isfinite(jacobian).all()
+
+
+def test_two_way_range_is_half_of_what_light_travels_besides_the_delays() -> None:
+    # 20 ns there and back are 299.792458 mm a nanosecond, halved.
+    sent, delays = np.array([1.0e-3, 0.0]), np.array([300e-9, 0.0])
+    received = sent + 2.0 * delays + 20e-9
+    found = two_way_range(sent, received, delays, delays)
+    np.testing.assert_allclose(found, 2.99792458, atol=1e-9)
+    late = two_way_range(sent, received + 1e-9, delays, delays) - found
+    np.testing.assert_allclose(late, 0.149896229, atol=1e-9)

@@ -1,0 +1,196 @@
+"""An estimator that finds its start, and finds itself again when it was carried off or led astray."""
+
+from dataclasses import replace
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from estimators.base import Report, Settable, Setup, Verdict
+from estimators.geometry import compose, inverse
+from estimators.messages import FloatArray, Measurement, PoseEstimate, PoseIncrement, RangeFrame
+from estimators.range_gate import RangeGate
+from estimators.relocation.search import Minimum, find_pose, lies_outside, too_short, total_loss
+from estimators.relocation.window import PlacedRanges, Window
+
+SHORTER = (1.0, 0.5)
+"""Shares of the window that are tried: after the robot was carried off, a long one tells of two places."""
+LEAST_SPREAD = 0.1
+"""A way along which tags lie no further apart than this [m] holds no heading worth a search."""
+MOST_SIGMA_XY = 0.3
+"""A found position less certain than this [m] is not taken."""
+DOUBTFUL_LOSS = 0.75
+"""Mean loss of a range above which a pose is compared with what a search finds; that of good ones is 0.5."""
+CLEARLY_LESS, CLEARLY_BELOW = 1.5, 5.0
+"""Another pose must have this many times the loss, and so much more, to be ruled out."""
+LEAST_AGREEING = 0.5
+"""Least share of ranges that agree in every third of the way: it must not begin or end elsewhere."""
+MOST_MEAN_SQUARE = 2.0
+"""Of normalised residuals; a wrong pose that seems to explain all ranges explains them badly."""
+LOST_YAW_SIGMA = 0.35
+"""With less certain a heading than this [rad] a filter is set to what is found without further proof."""
+MOST_TOO_SHORT = 0.1
+"""Share of ranges too short for a filter's pose above which it may be wrong: blocked ones are too long."""
+OUTSIDE = 0.999
+"""Confidence with which a found pose must differ from the filter's."""
+
+
+class Recovering:
+    """A filter together with a search that needs none.
+
+    Before the start is known there is no pose. A known filter is only disturbed when the last seconds' ranges
+    agree, most of them and along the whole way, on one other pose, clearly not on its own, and some are too
+    short for its own: blocked anchors only lengthen ranges, so they do not move a filter that is right.
+
+    Args:
+        wrapped: the filter.
+        config: of the search.
+        gate: as the filter's, for the noise of its ranges.
+        setup: geometry of the site.
+    """
+
+    class Config(BaseModel):
+        """Settings of the search for an unknown or lost pose."""
+
+        model_config = ConfigDict(extra="forbid", frozen=True)
+
+        enabled: bool = Field(
+            True, description="whether to look for an unknown start, and for a pose that was lost"
+        )
+        window: float = Field(
+            5.0, ge=1, le=60, description="the last so many seconds of motion and ranges are looked at [s]"
+        )
+        period: float = Field(0.5, ge=0.1, le=60, description="time between two searches [s]")
+        bias_sigma: float = Field(
+            0.05,
+            ge=0,
+            le=5,
+            description="standard deviation of what all ranges of an anchor err by in common [m]",
+        )
+        max_sigma_yaw_deg: float = Field(
+            5.0, gt=0, le=30, description="a found heading less certain than this is not taken [deg]"
+        )
+        min_agreeing: float = Field(
+            0.65, ge=0.5, le=1, description="least share of ranges that agree with a found pose"
+        )
+
+    def __init__(self, wrapped: Settable, config: Config, gate: RangeGate, setup: Setup) -> None:
+        self._wrapped = wrapped
+        self._config = config
+        self._period_ns = round(config.period * 1e9)
+        self._starts_known = setup.start.known
+        self._window = Window(config.window, gate, setup.tag_in_body)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything but configuration and setup."""
+        self._wrapped.reset()
+        self._window.clear()
+        self._known = self._starts_known
+        self._note = "" if self._known else self._doubt(None)
+        self._searched_ns: int | None = None
+
+    def update(self, measurement: Measurement) -> Report:
+        """Take one measurement; while the pose is looked for, the report's note says what is missing."""
+        if isinstance(measurement, RangeFrame):
+            verdicts = self._window.add_ranges(measurement)
+        elif isinstance(measurement, PoseIncrement):
+            verdicts = [self._window.add_increment(measurement)]
+        else:
+            verdicts = [Verdict.NOT_USED]
+        report = self._wrapped.update(measurement) if self._known else Report(tuple(verdicts))
+        if isinstance(measurement, PoseIncrement) and verdicts == [Verdict.WAITING]:
+            self._look_round(measurement.stamp_ns)
+        return replace(report, note=self._note) if self._note else report
+
+    def pose_at(self, stamp_ns: int) -> PoseEstimate | None:
+        """Pose of the filter; None before the start is known."""
+        return self._wrapped.pose_at(stamp_ns) if self._known else None
+
+    def _look_round(self, now_ns: int) -> None:
+        """Search when it is time for it, and there is reason to."""
+        if self._searched_ns is not None and now_ns - self._searched_ns < self._period_ns:
+            return
+        self._searched_ns = now_ns
+        estimate = self._wrapped.pose_at(now_ns) if self._known else None
+        if estimate is not None and not estimate.cov[5, 5] < LOST_YAW_SIGMA**2:
+            estimate = None
+        self._note = self._doubt(estimate)
+
+    def _doubt(self, estimate: PoseEstimate | None) -> str:
+        """Set the filter to another pose if ranges speak for one; say what is missing if it has none.
+
+        Args:
+            estimate: what the filter says; None when it does not know its pose.
+        """
+        note, tried = "", 0
+        for share in SHORTER:
+            placed = self._window.ranges_since(share * self._config.window)
+            if placed is None or len(placed.ranges) in (tried, 0):
+                break
+            tried = len(placed.ranges)
+            held = None if estimate is None else self._at_keyframe(estimate)
+            if held is not None and float(total_loss(placed, held[None])[0]) < DOUBTFUL_LOSS * tried:
+                break
+            found, flaw = self._search(placed)
+            note = note or flaw
+            if found is None:
+                continue
+            if estimate is None or held is None or _rules_out(found, placed, held, estimate.planar_cov):
+                self._set(found)
+                return ""
+        if estimate is not None:
+            return ""
+        return f"looking for the pose: {note or 'waiting for LiDAR increments and ranges'}"
+
+    def _at_keyframe(self, estimate: PoseEstimate) -> FloatArray:
+        """Where the filter must have been at the newest keyframe, (3,)."""
+        newest = np.array([*estimate.xy, estimate.yaw])
+        return compose(newest, inverse(self._window.newest_pose))
+
+    def _search(self, placed: PlacedRanges) -> tuple[Minimum | None, str]:
+        """The pose of the newest keyframe, or None and what speaks against it."""
+        spread = float(np.sqrt(placed.tags.var(axis=0).sum()))
+        if spread < LEAST_SPREAD:
+            return None, "drive a metre"
+        found = find_pose(placed, self._config.bias_sigma)
+        if found is None:
+            return None, "ranges to two anchors at least are needed"
+        if float(np.rad2deg(np.sqrt(found.cov[2, 2]))) > self._config.max_sigma_yaw_deg:
+            return None, "drive a metre"
+        if (
+            found.agreeing < self._config.min_agreeing
+            or found.least_agreeing < LEAST_AGREEING
+            or found.mean_square > MOST_MEAN_SQUARE
+        ):
+            return None, f"ranges contradict each other, {found.agreeing:.0%} agree"
+        if not _is_clearly_less(found.loss, found.rival):
+            return None, "ranges fit two places, drive a curve"
+        if float(np.sqrt(np.linalg.eigvalsh(found.cov[:2, :2])[1])) > MOST_SIGMA_XY:
+            return None, "position is not sure enough yet"
+        return found, ""
+
+    def _set(self, found: Minimum) -> None:
+        """Put the filter where it should have been at the newest keyframe, and let it follow from there."""
+        assert self._window.keyframe_ns is not None
+        self._wrapped.start_at(self._window.keyframe_ns, found.pose, found.cov)
+        for increment in self._window.since_keyframe:
+            self._wrapped.update(increment)
+        self._known = True
+
+
+def _is_clearly_less(loss: float, other: float) -> bool:
+    return other > CLEARLY_LESS * loss + CLEARLY_BELOW
+
+
+def _rules_out(found: Minimum, placed: PlacedRanges, held: FloatArray, cov: FloatArray) -> bool:
+    """Whether a filter that holds this pose (3,) with this covariance (3, 3) must be wrong.
+
+    Two anchors of four that are blocked alike fit a wrong place with a third one better than the right place
+    without. But at the right place no range is too short.
+    """
+    loss = float(total_loss(placed, held[None])[0])
+    return (
+        too_short(placed, held) > MOST_TOO_SHORT
+        and _is_clearly_less(found.loss, loss)
+        and lies_outside(found.pose, held, found.cov + cov, OUTSIDE)
+    )

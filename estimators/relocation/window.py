@@ -1,0 +1,213 @@
+"""The last seconds of odometry, as one rigid piece of way, with the ranges that were measured along it."""
+
+from collections import deque
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from estimators.base import Verdict
+from estimators.geometry import compose, inverse, transform, transform_each, wrap_angle
+from estimators.lidar.keyframes import is_covariance
+from estimators.messages import FloatArray, IntArray, PoseIncrement, RangeFrame
+from estimators.range_gate import RangeGate
+
+LONGEST_STEP_NS = 500_000_000
+"""Ranges between two poses further apart than this have no place on the way."""
+MOST_RANGES = 250
+"""More ranges than this say little more, and cost time."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlacedRanges:
+    """Ranges along a piece of way. Its frame is the body's at the newest keyframe.
+
+    Attributes:
+        tags: (N, 2) where the tag was [m], frame of the way; in stamp order.
+        anchors: (N, 2) [m], map frame.
+        anchor_ids: (N,) int64.
+        ranges: (N,) horizontal [m].
+        sigmas: (N,) standard deviation of each, what the odometry drifts until the keyframe included [m].
+        steps: (N,) int64, how many of the odometry's steps lie between a range and the newest keyframe.
+        step_poses: (K, 3) where each such step began, frame of the way, newest first.
+        step_ends: (K, 2) where it ended [m].
+        step_covs: (K, 3, 3) covariance of each as the odometry gave it.
+    """
+
+    tags: FloatArray
+    anchors: FloatArray
+    anchor_ids: IntArray
+    ranges: FloatArray
+    sigmas: FloatArray
+    steps: IntArray
+    step_poses: FloatArray
+    step_ends: FloatArray
+    step_covs: FloatArray
+
+    def some(self, index: IntArray) -> "PlacedRanges":
+        """Only the ranges at these indices."""
+        return replace(
+            self,
+            tags=self.tags[index],
+            anchors=self.anchors[index],
+            anchor_ids=self.anchor_ids[index],
+            ranges=self.ranges[index],
+            sigmas=self.sigmas[index],
+            steps=self.steps[index],
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Placed:
+    stamp_ns: int
+    step: int
+    tag: FloatArray
+    rows: FloatArray  # (N, 5): anchor x, anchor y, anchor id, range, sigma
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Step:
+    begin: FloatArray
+    end: FloatArray
+    cov: FloatArray
+
+
+class Window:
+    """Chains increments through their keyframes and puts ranges where they were measured.
+
+    Args:
+        length: how far back ranges are kept [s].
+        gate: reduces ranges to the horizontal.
+        tag_in_body: (3,) [m].
+    """
+
+    def __init__(self, length: float, gate: RangeGate, tag_in_body: FloatArray) -> None:
+        self._length_ns = round(length * 1e9)
+        self._gate = gate
+        self._arm = tag_in_body[None, :2]
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget everything."""
+        self._newest_ns: int | None = None
+        self._waiting: deque[tuple[int, FloatArray]] = deque()
+        self._break_off()
+
+    def _break_off(self) -> None:
+        """What lies behind hangs together with nothing to come."""
+        self.keyframe_ns: int | None = None
+        self.since_keyframe: list[PoseIncrement] = []
+        """Increments from the newest keyframe on."""
+        self._keyframe = self._last = np.zeros(3)
+        self._last_ns: int | None = None
+        self._placed: deque[_Placed] = deque()
+        self._steps: deque[_Step] = deque()
+        self._steps_made = 0
+
+    @property
+    def newest_pose(self) -> FloatArray:
+        """(3,) where the body is at the newest increment, seen from the newest keyframe."""
+        return self.since_keyframe[-1].increment if self.since_keyframe else np.zeros(3)
+
+    def add_ranges(self, frame: RangeFrame) -> list[Verdict]:
+        """Take a frame; what can be used gets `Verdict.WAITING`."""
+        if self._is_late(frame.stamp_ns):
+            return [Verdict.LATE] * len(frame.ranges)
+        verdicts: list[Verdict] = []
+        rows: list[tuple[float, ...]] = []
+        for anchor_id, item in zip(frame.anchor_ids.tolist(), self._gate.horizontal(frame), strict=True):
+            if isinstance(item, Verdict):
+                verdicts.append(item)
+            else:
+                anchor, measured, sigma = item
+                verdicts.append(Verdict.WAITING)
+                rows.append((anchor[0], anchor[1], anchor_id, measured, sigma))
+        if rows:
+            self._waiting.append((frame.stamp_ns, np.array(rows)))
+            while self._waiting[0][0] < frame.stamp_ns - self._length_ns:
+                self._waiting.popleft()
+        return verdicts
+
+    def add_increment(self, measured: PoseIncrement) -> Verdict:
+        """Take an increment; one that does not hang together with those before begins a new way."""
+        if self._is_late(measured.stamp_ns):
+            return Verdict.LATE
+        founds = measured.from_stamp_ns == measured.stamp_ns
+        possible = founds or (bool(np.isfinite(measured.increment).all()) and is_covariance(measured.cov))
+        if founds or not possible or measured.from_stamp_ns != self.keyframe_ns:
+            self._break_off()
+            self._waiting.clear()
+            if measured.is_keyframe:
+                self.keyframe_ns = self._last_ns = measured.stamp_ns
+            return Verdict.WAITING if possible else Verdict.IMPOSSIBLE
+        pose = compose(self._keyframe, measured.increment)
+        self._place_waiting(measured.stamp_ns, pose)
+        self._last, self._last_ns = pose, measured.stamp_ns
+        if measured.is_keyframe:
+            self._steps.append(_Step(self._keyframe, pose, measured.cov))
+            self._steps_made += 1
+            self._keyframe, self.keyframe_ns, self.since_keyframe = pose, measured.stamp_ns, []
+        else:
+            self.since_keyframe.append(measured)
+        self._forget(measured.stamp_ns - self._length_ns)
+        return Verdict.WAITING
+
+    def ranges_since(self, age: float) -> PlacedRanges | None:
+        """Ranges measured in the last so many seconds; None without any."""
+        if self._last_ns is None:
+            return None
+        since_ns = self._last_ns - round(age * 1e9)
+        placed = [item for item in self._placed if item.stamp_ns >= since_ns]
+        count = sum(len(item.rows) for item in placed)
+        if not count:
+            return None
+        placed = placed[:: -(-count // MOST_RANGES)]
+        T_keyframe_way = inverse(self._keyframe)
+        rows = np.concatenate([item.rows for item in placed])
+        each = [len(item.rows) for item in placed]
+        tags = transform(T_keyframe_way, np.array([item.tag for item in placed])).repeat(each, axis=0)
+        steps = self._steps_made - np.array([item.step for item in placed], dtype=np.int64).repeat(each)
+        begun = list(self._steps)[::-1][: int(steps.max())]
+        begins = np.array([compose(T_keyframe_way, step.begin) for step in begun]).reshape(-1, 3)
+        ends = transform(T_keyframe_way, np.array([step.end[:2] for step in begun]).reshape(-1, 2))
+        covs = np.array([step.cov for step in begun]).reshape(-1, 3, 3)
+        sigmas = np.sqrt(rows[:, 4] ** 2 + _drift(tags, steps, ends, covs))
+        ids = rows[:, 2].astype(np.int64)
+        return PlacedRanges(tags, rows[:, :2], ids, rows[:, 3], sigmas, steps, begins, ends, covs)
+
+    def _is_late(self, stamp_ns: int) -> bool:
+        if self._newest_ns is not None and stamp_ns < self._newest_ns:
+            return True
+        self._newest_ns = stamp_ns
+        return False
+
+    def _place_waiting(self, stamp_ns: int, pose: FloatArray) -> None:
+        """Put ranges that wait for this pose on the way from the pose before."""
+        assert self._last_ns is not None
+        span = stamp_ns - self._last_ns
+        ranges = [item for item in self._waiting if self._last_ns <= item[0] <= stamp_ns]
+        self._waiting.clear()
+        if not ranges or not 0 < span <= LONGEST_STEP_NS:
+            return
+        change = pose - self._last
+        change[2] = wrap_angle(change[2])
+        shares = np.array([(at_ns - self._last_ns) / span for at_ns, _ in ranges])
+        tags = transform_each(self._last + shares[:, None] * change, self._arm)
+        for (at_ns, rows), tag in zip(ranges, tags, strict=True):
+            self._placed.append(_Placed(at_ns, self._steps_made, tag, rows))
+
+    def _forget(self, before_ns: int) -> None:
+        while self._placed and self._placed[0].stamp_ns < before_ns:
+            self._placed.popleft()
+        oldest = self._placed[0].step if self._placed else self._steps_made
+        while len(self._steps) > self._steps_made - oldest:
+            self._steps.popleft()
+
+
+def _drift(tags: FloatArray, steps: IntArray, ends: FloatArray, covs: FloatArray) -> FloatArray:
+    """Variance (N,) along one axis of each tag's place, as far as steps since then have added to it [m^2]."""
+    shift = np.concatenate([[0.0], np.cumsum(0.5 * (covs[:, 0, 0] + covs[:, 1, 1]))])
+    total: FloatArray = shift[steps]
+    for k, (end, cov) in enumerate(zip(ends, covs, strict=True)):
+        older = steps > k
+        total[older] += 0.5 * cov[2, 2] * ((tags[older] - end) ** 2).sum(axis=1)
+    return total
