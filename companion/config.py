@@ -208,6 +208,7 @@ class Config(Table):
             height=body.height,
             height_sigma=body.height_sigma,
             level_sigma=float(np.deg2rad(body.level_sigma_deg)),
+            lidar_in_body=self.lidar_mounting(),
         )
 
     def lidar_mounting(self) -> FloatArray:

@@ -16,7 +16,7 @@ class Verdict(StrEnum):
     GATED = "gated"
     """Too far from the prediction (NIS above the gate)."""
     SUSPECT = "suspect"
-    """Near the prediction, but its anchor was gated a moment ago: it may still be blocked."""
+    """Near the prediction, but its anchor was blocked a moment ago and probably still is."""
     TOO_LONG = "NLOS: longer than predicted"
     """Its anchor is probably blocked, and this range is too long for the pose."""
     WEAK_FIRST_PATH = "NLOS: weak first path"
@@ -84,6 +84,7 @@ class Setup:
         height_sigma: standard deviation of `height` [m].
         level_sigma: standard deviation of roll and pitch [rad] of a robot that walks level.
         landmarks: landmark id -> position (2,) [m], map frame; those that are known beforehand.
+        lidar_in_body: (3,) mounting of the LiDAR in the body frame: x [m], y [m], yaw [rad].
     """
 
     anchors: dict[int, FloatArray]
@@ -93,6 +94,7 @@ class Setup:
     height_sigma: float
     level_sigma: float
     landmarks: dict[int, FloatArray] = field(default_factory=dict)
+    lidar_in_body: FloatArray = field(default_factory=lambda: np.zeros(3))
 
     def height_to(self, anchor: FloatArray) -> float:
         """Height of an anchor above the tag [m]."""

@@ -6,14 +6,14 @@ from estimators.base import Report, Setup, Verdict
 from estimators.lidar.odometry import POSE, LidarOdometry
 from estimators.messages import Measurement, RangeFrame
 from estimators.models.range import horizontal_range
-from estimators.range_gate import RangeGate
+from estimators.range_gate import USED, RangeGate
 
 
 class Ekf(LidarOdometry):
     """LiDAR odometry held in place by tightly coupled UWB ranges.
 
-    Every range corrects the state on its own, through the lever arm and after height reduction, when it
-    passes the NIS gate. The state is that of `LidarOdometry`.
+    Every range corrects the state on its own, through the lever arm and after height reduction, when
+    `RangeGate` lets it pass. The state is that of `LidarOdometry`.
 
     Source: chen2019 Eq. (5)-(20); the paper's state and Jacobians are lost, those here are ours and
     are tested against finite differences.
@@ -32,9 +32,11 @@ class Ekf(LidarOdometry):
         self._gate.reset()
 
     def update(self, measurement: Measurement) -> Report:
-        """Predict to the measurement's time and take it; only ranges and increments are used."""
+        """Predict to the measurement's time and take it; scans only show what blocks ranges."""
         if not isinstance(measurement, RangeFrame):
-            return super().update(measurement)
+            report = super().update(measurement)
+            self._gate.see(measurement, self.pose_at)
+            return report
         if self._is_late(measurement.stamp_ns):
             return Report((Verdict.LATE,) * len(measurement.ranges))
         self._predict_to(measurement.stamp_ns)
@@ -44,18 +46,21 @@ class Ekf(LidarOdometry):
         count = len(frame.ranges)
         verdicts = [Verdict.ACCEPTED] * count
         residuals, nis = np.full(count, np.nan), np.full(count, np.nan)
-        for i, item in enumerate(self._gate.horizontal(frame)):
-            if isinstance(item, Verdict):
-                verdicts[i] = item
+        for i, candidate in enumerate(self._gate.candidates(frame, self._filter.x[POSE])):
+            if isinstance(candidate, Verdict):
+                verdicts[i] = candidate
                 continue
-            anchor, measured, sigma = item
-            predicted, by_pose = horizontal_range(self._filter.x[POSE], anchor, self._setup.tag_in_body)
+            measured, sigma = candidate.measured, candidate.sigma
+            predicted, by_pose = horizontal_range(
+                self._filter.x[POSE], candidate.anchor, self._setup.tag_in_body
+            )
             H = np.zeros((1, 9))
             H[0, POSE] = by_pose
             variance = float((H @ self._filter.P @ H.T).item()) + sigma**2
             residuals[i] = measured - predicted
             nis[i] = residuals[i] ** 2 / variance
-            verdicts[i] = self._gate.judge(int(frame.anchor_ids[i]), frame.stamp_ns, float(nis[i]))
-            if verdicts[i] is Verdict.ACCEPTED:
-                self._correct(np.array([measured]), H, np.array([predicted]), np.array([[sigma**2]]))
+            verdicts[i], factor = self._gate.judge(candidate, residuals[i], nis[i])
+            if verdicts[i] in USED:
+                R = np.array([[(factor * sigma) ** 2]])
+                self._correct(np.array([measured]), H, np.array([predicted]), R)
         return Report(tuple(verdicts), residuals, nis)

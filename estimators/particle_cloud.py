@@ -26,7 +26,7 @@ from estimators.messages import (
     RangeFrame,
 )
 from estimators.models.motion import constant_velocity
-from estimators.range_gate import RangeGate
+from estimators.range_gate import USED, Candidate, RangeGate
 
 POSE, VELOCITY, KEYFRAME, LAST = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
 _NO_RANGES, _NO_LANDMARKS = np.empty((0, 4)), np.empty((0, 6))
@@ -83,7 +83,7 @@ class ParticleCloud(KeyframeTracker):
         return self._particles.copy(), self._weights.copy()
 
     def update(self, measurement: Measurement) -> Report:
-        """Predict to the measurement's time and take it; scans and inertial sensors are not used."""
+        """Predict to the measurement's time and take it; scans only show what blocks ranges."""
         if isinstance(measurement, RangeFrame):
             if self._is_late(measurement.stamp_ns):
                 return Report((Verdict.LATE,) * len(measurement.ranges))
@@ -94,7 +94,9 @@ class ParticleCloud(KeyframeTracker):
                 return Report((Verdict.LATE,))
             self._predict_to(measurement.stamp_ns)
             return Report((self._update_landmarks(measurement),))
-        return super().update(measurement)
+        report = super().update(measurement)
+        self._gate.see(measurement, self.pose_at)
+        return report
 
     def pose_at(self, stamp_ns: int) -> PoseEstimate | None:
         """Mean and covariance, predicted with constant velocity; None before the first measurement."""
@@ -159,29 +161,26 @@ class ParticleCloud(KeyframeTracker):
         count = len(frame.ranges)
         verdicts = [Verdict.ACCEPTED] * count
         innovations, nis = np.full(count, np.nan), np.full(count, np.nan)
-        used: list[int] = []
-        rows: list[tuple[float, ...]] = []
-        for i, item in enumerate(self._gate.horizontal(frame)):
+        candidates: dict[int, Candidate] = {}
+        mean, _ = self._cloud.moments(self._particles, self._weights, 3)
+        for i, item in enumerate(self._gate.candidates(frame, mean)):
             if isinstance(item, Verdict):
                 verdicts[i] = item
             else:
-                anchor, measured, sigma = item
-                used.append(i)
-                rows.append((anchor[0], anchor[1], measured, sigma))
-        if not used:
+                candidates[i] = item
+        if not candidates:
             return Report(tuple(verdicts), innovations, nis)
-        ids: list[int] = frame.anchor_ids[used].tolist()
-        ranges = np.array(rows)
-        doubted = np.array([self._gate.doubts(anchor_id, frame.stamp_ns) for anchor_id in ids])
+        used = list(candidates)
+        ranges = np.array([(c.anchor[0], c.anchor[1], c.measured, c.sigma) for c in candidates.values()])
+        doubted = np.array([c.log_odds > 0.0 for c in candidates.values()])
         residuals = self._residuals(ranges, _NO_LANDMARKS)
         innovations[used], nis[used] = self._likelihood.innovations(
             residuals, self._weights, ranges[:, 3].copy(), self._gate.limit, doubted
         )
-        for k, i in enumerate(used):
-            verdicts[i] = self._gate.judge(ids[k], frame.stamp_ns, float(nis[i]))
-            if verdicts[i] is not Verdict.ACCEPTED:
-                ranges[k, 3] = np.inf
-        if Verdict.ACCEPTED in verdicts:
+        for k, (i, candidate) in enumerate(candidates.items()):
+            verdicts[i], factor = self._gate.judge(candidate, innovations[i], nis[i])
+            ranges[k, 3] *= factor if verdicts[i] in USED else np.inf
+        if not USED.isdisjoint(verdicts):
             self._weigh(residuals, ranges, _NO_LANDMARKS)
         return Report(tuple(verdicts), innovations, nis)
 
