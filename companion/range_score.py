@@ -52,7 +52,7 @@ class RangeScore:
             if verdict not in _JUDGED:
                 continue
             weakened = verdict is Verdict.DOWNWEIGHTED
-            rejected = verdict is not Verdict.ACCEPTED and not weakened
+            rejected = not verdict.is_used
             if one > BIASED_SIGMAS * sigma:
                 self.biased += 1
                 self.biased_rejected += rejected

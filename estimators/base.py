@@ -38,6 +38,19 @@ class Verdict(StrEnum):
     NOT_USED = "not used"
     """This estimator has no use for such a measurement."""
 
+    @property
+    def is_nlos(self) -> bool:
+        """Whether a range was rejected because something probably blocks it."""
+        return self in _NLOS
+
+    @property
+    def is_used(self) -> bool:
+        """Whether the measurement changed the estimate."""
+        return self in _USED
+
+
+_NLOS = frozenset({Verdict.SUSPECT, Verdict.TOO_LONG, Verdict.WEAK_FIRST_PATH, Verdict.OBSTRUCTED})
+_USED = frozenset({Verdict.ACCEPTED, Verdict.DOWNWEIGHTED})
 
 _EMPTY = np.empty(0)
 

@@ -6,7 +6,7 @@ from estimators.base import Report, Setup, Verdict
 from estimators.lidar.odometry import POSE, LidarOdometry
 from estimators.messages import Measurement, RangeFrame
 from estimators.models.range import horizontal_range
-from estimators.range_gate import USED, RangeGate
+from estimators.range_gate import RangeGate
 
 
 class Ekf(LidarOdometry):
@@ -60,7 +60,7 @@ class Ekf(LidarOdometry):
             residuals[i] = measured - predicted
             nis[i] = residuals[i] ** 2 / variance
             verdicts[i], factor = self._gate.judge(candidate, residuals[i], nis[i])
-            if verdicts[i] in USED:
+            if verdicts[i].is_used:
                 R = np.array([[(factor * sigma) ** 2]])
                 self._correct(np.array([measured]), H, np.array([predicted]), R)
         return Report(tuple(verdicts), residuals, nis)

@@ -26,7 +26,7 @@ from estimators.messages import (
     RangeFrame,
 )
 from estimators.models.motion import constant_velocity
-from estimators.range_gate import USED, Candidate, RangeGate
+from estimators.range_gate import Candidate, RangeGate
 
 POSE, VELOCITY, KEYFRAME, LAST = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
 _NO_RANGES, _NO_LANDMARKS = np.empty((0, 4)), np.empty((0, 6))
@@ -179,8 +179,8 @@ class ParticleCloud(KeyframeTracker):
         )
         for k, (i, candidate) in enumerate(candidates.items()):
             verdicts[i], factor = self._gate.judge(candidate, innovations[i], nis[i])
-            ranges[k, 3] *= factor if verdicts[i] in USED else np.inf
-        if not USED.isdisjoint(verdicts):
+            ranges[k, 3] *= factor if verdicts[i].is_used else np.inf
+        if any(verdict.is_used for verdict in verdicts):
             self._weigh(residuals, ranges, _NO_LANDMARKS)
         return Report(tuple(verdicts), innovations, nis)
 

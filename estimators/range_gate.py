@@ -1,4 +1,4 @@
-"""Which ranges of a frame a filter believes, and how much: shared by all that hold predictions against them."""
+"""Which ranges of a frame a filter believes, and how much: shared by all that predict them."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,8 +16,6 @@ from estimators.nlos.prediction import PRIOR, Prediction, excess_log_ratio
 from estimators.nlos.robust import sigma_factor
 from estimators.nlos.visibility import Visibility
 
-USED = frozenset({Verdict.ACCEPTED, Verdict.DOWNWEIGHTED})
-"""Verdicts on ranges that a filter takes."""
 NlosMethod = Literal["prediction", "power", "visibility", "robust"]
 
 
