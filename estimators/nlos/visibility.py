@@ -73,11 +73,11 @@ class Visibility:
         length = hypot(*offset)
         begin, end = MARGIN, length - MARGIN
         climb = self._setup.height_to(anchor)
-        room = self._obstacle_height - float(anchor[2]) + climb
-        if climb > room:
+        room = self._obstacle_height - float(anchor[2]) + climb  # from the tag up to the obstacles' height
+        if climb > 0.0:
             end = min(end, room / climb * length)
-        elif climb < room < 0.0:
-            begin = max(begin, room / climb * length)
+        elif room <= 0.0:
+            begin = max(begin, room / climb * length if climb < 0.0 else length)
         if not begin < end:
             return 0.0
         direction = offset / length
