@@ -68,6 +68,8 @@ class Visibility:
             pose: (3,) x [m], y [m], yaw [rad] of the body in the map.
             anchor: (3,) [m], map frame.
         """
+        if not self.grid.log_odds.size:
+            return 0.0
         tag_in_map = compose(pose, np.array([*self._setup.tag_in_body[:2], 0.0]))[:2]
         offset = anchor[:2] - tag_in_map
         length = hypot(*offset)
