@@ -9,6 +9,7 @@ import pytest
 from estimators import estimator_config_class, make_estimator
 from estimators.base import Setup, Start, Verdict
 from estimators.messages import FloatArray, PoseIncrement, RangeFrame
+from estimators.nlos.visibility import OBSTRUCTED, Visibility
 from estimators.range_gate import Candidate, NlosMethod, RangeGate
 from tests.estimators.matched_world import HALL, true_ranges
 from tests.strategies import range_frame
@@ -44,7 +45,7 @@ def judged(of: RangeGate, k: int, residual: float, difference: float = NO_POWER)
 
 def obstruct(monkeypatch: pytest.MonkeyPatch) -> None:
     """The LiDAR sees an obstacle on every line."""
-    monkeypatch.setattr("estimators.nlos.visibility.OccupancyGrid.blocked", lambda *_: True)
+    monkeypatch.setattr(Visibility, "log_ratio", lambda *_: OBSTRUCTED)
 
 
 def test_without_methods_the_nis_decides_both_ways() -> None:
