@@ -54,7 +54,7 @@ def blueprint(config: Config, primary: str, plots: dict[str, float | None]) -> r
     )
     return rrb.Blueprint(
         rrb.Horizontal(
-            rrb.Vertical(map_view, verdicts, health, row_shares=[4.5, 1.0, 1.0]),
+            rrb.Vertical(map_view, verdicts, health, row_shares=[4.5, 1.7, 1.0]),
             rrb.Vertical(*views, visible=bool(views)),
             column_shares=[1.5, 1.0],
         ),
