@@ -99,7 +99,7 @@ def demo(
     log is replayed with three estimators side by side.
     """
     from companion.demo import run_demo
-    from companion.tables import accuracy_table, sensor_lines
+    from companion.tables import accuracy_table, anchor_table, sensor_lines
 
     loaded = _load_scenario(scenario, seed, sets)
     with _progress() as progress:
@@ -109,6 +109,7 @@ def demo(
         )
     out.print(f"[bold]{loaded.file.description}[/]" if loaded.file.description else loaded.name)
     out.print(accuracy_table(result, f"{result.duration:.0f} s against truth, seed {loaded.seed}"))
+    out.print(anchor_table(result))
     for line in sensor_lines(result):
         out.print(f"  {line}", highlight=False)
     definite = "all" if received.all_positive_definite else "NOT ALL"
@@ -236,15 +237,15 @@ def replay(
 ) -> None:
     """Run a log through the very same decoders and estimators as live, without sleeping.
 
-    Writes poses.tum, summary.json, config.toml and replay.rrd. The same log and settings give the same
-    poses, byte for byte. The settings are those stored in the log; change them with --set, or give a
-    corrected site file with --site.
+    Writes poses.tum, ranges.csv (every range with its verdict), summary.json, config.toml and replay.rrd.
+    The same log and settings give the same poses, byte for byte. The settings are those stored in the log;
+    change them with --set, or give a corrected site file with --site.
     """
     from companion.log import Log
     from companion.replay import config_of, write_outputs
     from companion.replay import replay as run_log
     from companion.rerun_view import RerunView
-    from companion.tables import accuracy_table, sensor_lines
+    from companion.tables import accuracy_table, anchor_table, sensor_lines
     from estimators import ESTIMATORS
 
     opened = Log(log)
@@ -269,9 +270,13 @@ def replay(
         err.print(f"[yellow]{log} ends abruptly (killed process or damaged file); replayed what is there[/]")
     title = f"{result.duration:.1f} s in {took:.1f} s ({result.duration / took:.0f} x real time)"
     out.print(accuracy_table(result, title + ("" if result.errors else ", no truth in the log")))
+    out.print(anchor_table(result))
     for line in sensor_lines(result):
         out.print(f"  {line}", highlight=False)
-    out.print(f"  written to {folder}: poses.tum, summary.json, config.toml, replay.rrd", highlight=False)
+    out.print(
+        f"  written to {folder}: poses.tum, ranges.csv, summary.json, config.toml, replay.rrd",
+        highlight=False,
+    )
 
 
 @evaluate_app.command("scenario")

@@ -18,6 +18,7 @@ from scipy.stats import chi2
 from companion.config import Config
 from companion.errors import UserError
 from companion.estimator_choice import chosen_settings, split_choice
+from companion.range_score import pooled
 from companion.sim.scenario import load_scenario
 from companion.sim.scenario_tables import PaperTable
 from companion.trial import LIDAR_ALONE, UWB_ALONE, TrialFigures, run_trial
@@ -45,6 +46,7 @@ class MeanFigures:
         nees_bounds: the mean NEES of an honest covariance lies between these with 95 % probability. The
             samples of a trial follow each other too closely to be independent: each trial counts as one
             sample, which makes the bounds too wide rather than too narrow.
+        ranges: what became of the ranges of all trials together, see `companion.range_score.pooled`.
     """
 
     rmse_m: float
@@ -59,6 +61,7 @@ class MeanFigures:
     nees_bounds: tuple[float, float]
     update_us: UpdateTime
     bound_ratio: float | None
+    ranges: dict[str, float | int | None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -200,6 +203,7 @@ def _mean(results: list[TrialFigures | None]) -> MeanFigures | None:
         nees_bounds=nees_bounds([each.nees_dof for each in figures]),
         update_us=UpdateTime(median, p99),
         bound_ratio=mean_if_known("bound_ratio"),
+        ranges=pooled(each.ranges for each in figures),
     )
 
 

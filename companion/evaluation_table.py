@@ -1,5 +1,7 @@
 """An evaluation as a table for a terminal, published figures under our own."""
 
+from collections.abc import Mapping
+
 from rich import box
 from rich.table import Table
 
@@ -41,7 +43,26 @@ def evaluation_notes(result: Evaluation) -> list[str]:
             f"{name}: within 0.3 m and 10 deg to the end {median} (median); within 5 s of motion in "
             f"{found['within_5_s']} of {result.trials} trials"
         )
-    return notes
+    return notes + [
+        _range_note(name, figures.ranges)
+        for name, figures in result.estimators.items()
+        if figures and figures.ranges["biased"]
+    ]
+
+
+def _range_note(name: str, ranges: Mapping[str, float | int | None]) -> str:
+    """What an estimator made of blocked and of clean ranges."""
+
+    def fate(kind: str) -> str:
+        rejected, weakened = ranges[f"{kind}_rejected"], ranges[f"{kind}_downweighted"]
+        if rejected is None or weakened is None:
+            return "none"
+        return f"{rejected:.1%} rejected" + (f", {weakened:.1%} down-weighted" if weakened else "")
+
+    return (
+        f"{name}: of {ranges['biased']} ranges that are too long by more than 3 sigma {fate('biased')}; of "
+        f"{ranges['clean']} clean ones {fate('clean')}"
+    )
 
 
 def _cells(figures: MeanFigures) -> list[str]:

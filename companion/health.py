@@ -1,5 +1,6 @@
 """Whether the pose is good enough to fly on: what the autopilot must never receive is decided here."""
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -13,6 +14,8 @@ MEMORY = 2.0
 """Time constant [s] over which the shares of accepted and of too short ranges are remembered."""
 REGAIN = 1.5
 """Agreement of ranges and pose must be better by this factor to be reached than to be kept."""
+_DISAGREES = frozenset({Verdict.GATED, Verdict.TOO_LONG, Verdict.DOWNWEIGHTED})
+"""Verdicts on ranges that do not fit the pose."""
 
 
 class State(StrEnum):
@@ -55,6 +58,37 @@ class _Source:
     first_awaited: bool
 
 
+@dataclass(frozen=True, slots=True)
+class AnchorState:
+    """What became of an anchor's ranges lately.
+
+    Attributes:
+        anchor_id: whose they are.
+        is_used: whether one was used lately.
+        reason: why not, the verdict on the newest; empty when they are used, or when none came at all.
+    """
+
+    anchor_id: int
+    is_used: bool
+    reason: str
+
+    @property
+    def trouble(self) -> str:
+        """Why it is not used, in a word."""
+        if self.is_used:
+            return ""
+        if not self.reason:
+            return "silent"
+        return "NLOS" if Verdict(self.reason).is_nlos else self.reason
+
+
+def uwb_line(anchors: Sequence[AnchorState]) -> str:
+    """One line for the operator: how many anchors are used, and what is wrong with the others."""
+    used = sum(anchor.is_used for anchor in anchors)
+    others = [f", A{anchor.anchor_id} {anchor.trouble}" for anchor in anchors if not anchor.is_used]
+    return f"UWB: {used} of {len(anchors)} anchors" + "".join(others)
+
+
 class HealthMonitor:
     """Follows the verdicts on the pose that is sent.
 
@@ -62,10 +96,16 @@ class HealthMonitor:
         table: limits.
         has_ranges: the site has a UWB sensor.
         has_scans: the site has a LiDAR.
+        anchor_ids: of the site.
     """
 
-    def __init__(self, table: HealthTable, has_ranges: bool, has_scans: bool) -> None:
+    def __init__(
+        self, table: HealthTable, has_ranges: bool, has_scans: bool, anchor_ids: Iterable[int] = ()
+    ) -> None:
         self._table = table
+        self._anchor_ids = tuple(anchor_ids)
+        self._heard: dict[int, tuple[int, Verdict]] = {}
+        self._used_ns: dict[int, int] = {}
         self._has_ranges = has_ranges
         self._has_scans = has_scans
         # Nothing is believed before ranges have agreed with the start pose for a while.
@@ -92,8 +132,10 @@ class HealthMonitor:
             return
         if not isinstance(measurement, RangeFrame):
             return
+        self._observe_anchors(measurement, report)
         gated = [i for i, verdict in enumerate(report.verdicts) if verdict is Verdict.GATED]
-        judged = good + len(gated)
+        # What else speaks for a blocked range says nothing of the pose.
+        judged = good + sum(verdict in _DISAGREES for verdict in report.verdicts)
         if not judged:
             return
         if good:
@@ -121,6 +163,27 @@ class HealthMonitor:
                 and self._short_share <= table.max_short_share / REGAIN
             )
         self._has_agreed |= self._agrees
+
+    def anchors(self, now_ns: int) -> list[AnchorState]:
+        """What became lately of the ranges of each anchor of the site."""
+
+        def is_recent(stamp_ns: int | None) -> bool:
+            return stamp_ns is not None and (now_ns - stamp_ns) * 1e-9 <= self._table.max_range_age
+
+        states = []
+        for anchor_id in self._anchor_ids:
+            is_used = is_recent(self._used_ns.get(anchor_id))
+            heard_ns, verdict = self._heard.get(anchor_id, (None, ""))
+            reason = "" if is_used or not is_recent(heard_ns) else str(verdict)
+            states.append(AnchorState(anchor_id, is_used, reason))
+        return states
+
+    def _observe_anchors(self, frame: RangeFrame, report: Report) -> None:
+        for anchor_id, verdict in zip(frame.anchor_ids.tolist(), report.verdicts, strict=True):
+            if verdict is not Verdict.NOT_USED:
+                self._heard[anchor_id] = frame.stamp_ns, verdict
+                if verdict.is_used:
+                    self._used_ns[anchor_id] = frame.stamp_ns
 
     def judge(self, pose: PoseEstimate | None, now_ns: int) -> Health:
         """State at `now_ns` for the pose that would be sent."""

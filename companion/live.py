@@ -12,18 +12,19 @@ from pathlib import Path
 
 from companion.config import Config, MavlinkTable, SensorTable
 from companion.errors import UserError
-from companion.health import Health
+from companion.health import Health, uwb_line
 from companion.log import Direction, LogWriter, RawChunk
 from companion.mavlink.link import NAME as MAVLINK
 from companion.mavlink.link import wire_opener
 from companion.mavlink.session import MavlinkSession
 from companion.pipeline import Chain, Tick, make_pipeline
+from companion.range_log import HEADER, range_lines
 from companion.replay import tum_line
 from drivers.discovery import Finder
 from drivers.inbox import Inbox
 from drivers.port import AutoAddress, Port, PortEvent, PortStatus, parse_address
 from drivers.serial_line import SerialWire
-from estimators.messages import PoseEstimate
+from estimators.messages import PoseEstimate, RangeFrame
 
 LONGEST_WAIT = 0.02
 """The loop looks at the dialogues of its devices at least this often [s]."""
@@ -31,6 +32,8 @@ CLOSING_PAUSE = 0.01
 """After each of the last words to a device [s]."""
 DROPS_PERIOD_NS = 5_000_000_000
 """The operator hears of dropped chunks at most this often."""
+ANCHORS_PERIOD_NS = 2_000_000_000
+"""The operator hears at most this often which anchors are used."""
 
 
 @dataclass(slots=True)
@@ -64,7 +67,7 @@ class LiveRun:
 
     Args:
         config: of the site.
-        folder: gets `raw.mcap`, `config.toml` and `poses.tum`.
+        folder: gets `raw.mcap`, `config.toml`, `poses.tum` and `ranges.csv`.
         say: takes one line for the operator when a port or the health changes.
 
     Raises:
@@ -76,13 +79,17 @@ class LiveRun:
         self.status = LiveStatus(dropped=self._inbox.dropped)
         self._say = say
         self._drops_said, self._drops_due_ns = 0, 0
+        self._anchors_said = ""
         # First what may refuse its settings, so that a wrong call leaves no folder behind.
         self._link = self._make_link(config.mavlink)
         start_ns = time.monotonic_ns()
+        self._anchors_due_ns = start_ns + ANCHORS_PERIOD_NS
         self._log = LogWriter(folder / "raw.mcap", config.to_toml(), start_ns)
         try:
             (folder / "config.toml").write_text(config.to_toml(), encoding="utf-8")
             self._poses = (folder / "poses.tum").open("w", encoding="utf-8", buffering=1)
+            self._ranges = (folder / "ranges.csv").open("w", encoding="utf-8", buffering=1)
+            self._ranges.write(HEADER)
         except OSError as error:
             raise UserError(f"cannot write to {folder}: {error.strerror}") from error
         self._primary = config.pipeline.estimator
@@ -153,6 +160,10 @@ class LiveRun:
         pose = tick.poses[self._primary]
         if pose is not None:
             self._poses.write(tum_line(pose))
+        for outcome in tick.outcomes:
+            if isinstance(outcome.measurement, RangeFrame):
+                self._ranges.write(range_lines(outcome.measurement, outcome.reports[self._primary]))
+        self._say_anchors(tick.stamp_ns)
         if self.status.health is None or tick.health.state != self.status.health.state:
             self._say(
                 f"health: {tick.health.state}" + (f" ({tick.health.reason})" * bool(tick.health.reason))
@@ -185,6 +196,13 @@ class LiveRun:
             names = ", ".join(f"{name} {count}" for name, count in self.status.dropped.items() if count)
             self._say(f"chunks dropped, they come faster than they can be used: {names}")
 
+    def _say_anchors(self, now_ns: int) -> None:
+        if now_ns >= self._anchors_due_ns:
+            line = uwb_line(self._chain.anchors(now_ns))
+            if line != self._anchors_said:
+                self._anchors_said, self._anchors_due_ns = line, now_ns + ANCHORS_PERIOD_NS
+                self._say(line)
+
     def _close(self) -> None:
         for name, sensor in self._chain.sensors.items():
             for data in sensor.closing():
@@ -195,4 +213,5 @@ class LiveRun:
         if self._link is not None:
             self._link.close()
         self._poses.close()
+        self._ranges.close()
         self._log.close()

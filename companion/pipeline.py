@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from companion.config import Config
-from companion.health import Health, HealthMonitor
+from companion.health import AnchorState, Health, HealthMonitor
 from companion.log import Direction, RawChunk
 from companion.sequencer import Sequencer
 from drivers import make_sensor
@@ -101,7 +101,7 @@ class Chain:
         self._pipeline = pipeline
         self._primary = primary
         measured = {kind for sensor in self.sensors.values() for kind in sensor.MEASURES}
-        self._monitor = HealthMonitor(config.health, RangeFrame in measured, Scan in measured)
+        self._monitor = HealthMonitor(config.health, RangeFrame in measured, Scan in measured, config.anchors)
         self._start_ns = start_ns
         self._period_ns = 1e9 / config.pipeline.rate
         self._ticks = 0
@@ -110,6 +110,10 @@ class Chain:
     def next_tick_ns(self) -> int:
         """When the next pose is due."""
         return self._start_ns + round(self._ticks * self._period_ns)
+
+    def anchors(self, now_ns: int) -> list[AnchorState]:
+        """What became lately of each anchor's ranges, by the primary estimator."""
+        return self._monitor.anchors(now_ns)
 
     def feed(self, chunk: RawChunk) -> Iterator[Tick]:
         """Give the ticks that were due before these bytes arrived, then decode the bytes."""

@@ -2,7 +2,7 @@
 
 import json
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -15,6 +15,7 @@ from companion.errors import UserError
 from companion.evaluate import Accuracy, Errors, Reference, compare
 from companion.log import Log, Truth
 from companion.pipeline import Chain, FrontEnd, Pipeline, Tick, make_parts
+from companion.range_log import HEADER, range_lines
 from drivers.framing import DecodeStats
 from estimators.base import Estimator, Report, Verdict
 from estimators.messages import Measurement, PoseEstimate, PoseIncrement, RangeFrame, Scan
@@ -84,6 +85,8 @@ class Replay:
         errors: estimator -> errors against the log's truth; empty without truth.
         update_times: estimator (and `scan_matcher`) -> time of its updates.
         verdicts: estimator -> how often each verdict was given to a range or increment.
+        anchor_verdicts: estimator -> anchor -> the same of its ranges.
+        range_lines: lines of `ranges.csv`, of the primary.
         health: state -> number of ticks.
         sensors: sensor -> what its decoder counted.
         late: measurements that came too late to be used.
@@ -97,6 +100,8 @@ class Replay:
     errors: dict[str, Errors] = field(default_factory=dict)
     update_times: dict[str, Stopwatch] = field(default_factory=dict)
     verdicts: dict[str, Counter[str]] = field(default_factory=dict)
+    anchor_verdicts: dict[str, dict[int, Counter[str]]] = field(default_factory=dict)
+    range_lines: list[str] = field(default_factory=list)
     health: Counter[str] = field(default_factory=Counter)
     sensors: dict[str, DecodeStats] = field(default_factory=dict)
     late: int = 0
@@ -141,6 +146,7 @@ def replay(
     result = Replay(config, names, {name: [] for name in names})
     result.update_times = {name: Stopwatch() for name in ["scan_matcher", *names]}
     result.verdicts = {name: Counter() for name in names}
+    result.anchor_verdicts = {name: defaultdict(Counter) for name in names}
     chain = Chain(config, begin_ns, _timed_pipeline(config, names, result.update_times), names[0])
     truths: list[Truth] = []
     ticks_ns: list[int] = []
@@ -152,6 +158,12 @@ def replay(
             if isinstance(outcome.measurement, RangeFrame | PoseIncrement):
                 for name, report in outcome.reports.items():
                     result.verdicts[name].update(report.verdicts)
+            if isinstance(outcome.measurement, RangeFrame):
+                frame = outcome.measurement
+                result.range_lines.append(range_lines(frame, outcome.reports[names[0]]))
+                for name, report in outcome.reports.items():
+                    for anchor_id, verdict in zip(frame.anchor_ids.tolist(), report.verdicts, strict=True):
+                        result.anchor_verdicts[name][anchor_id][verdict] += 1
         for name, pose in tick.poses.items():
             if pose is not None:
                 result.poses[name].append(pose)
@@ -185,7 +197,9 @@ def replay(
 
 
 def write_outputs(result: Replay, folder: Path) -> None:
-    """Write `poses.tum` (and `poses_NAME.tum` of further estimators), `summary.json`, `config.toml`.
+    """Write `poses.tum` (and `poses_NAME.tum` of further estimators) and what else is known of a replay.
+
+    That is `ranges.csv` (the primary's verdict on every range), `summary.json` and `config.toml`.
 
     Raises:
         UserError: the folder cannot be written.
@@ -195,6 +209,7 @@ def write_outputs(result: Replay, folder: Path) -> None:
         for i, name in enumerate(result.names):
             text = "".join(tum_line(pose) for pose in result.poses[name])
             (folder / (f"poses_{name}.tum" if i else "poses.tum")).write_text(text, encoding="utf-8")
+        (folder / "ranges.csv").write_text(HEADER + "".join(result.range_lines), encoding="utf-8")
         (folder / "summary.json").write_text(json.dumps(summary(result), indent=2) + "\n", encoding="utf-8")
         (folder / "config.toml").write_text(result.config.to_toml(), encoding="utf-8")
     except OSError as error:
@@ -216,6 +231,7 @@ def summary(result: Replay) -> dict[str, object]:
             "accuracy": asdict(accuracy) if (accuracy := result.accuracy(name)) else None,
             "update_ms": result.update_times[name].mean_ms,
             "verdicts": dict(result.verdicts[name]),
+            "anchors": {str(i): dict(counts) for i, counts in sorted(result.anchor_verdicts[name].items())},
         }
         for name in result.names
     }

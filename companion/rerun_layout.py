@@ -43,6 +43,7 @@ def blueprint(config: Config, primary: str, plots: dict[str, float | None]) -> r
         "ranges/nis": f"range NIS in {primary}, white: gate",
     }
     views = [_plot(entity, name, plots[entity]) for entity, name in names.items() if entity in plots]
+    verdicts = rrb.StateTimelineView(origin="ranges/verdict", name=f"verdict of {primary} on ranges")
     health = rrb.Horizontal(
         rrb.StateTimelineView(origin="health/state", name="health"),
         rrb.TextLogView(
@@ -53,7 +54,7 @@ def blueprint(config: Config, primary: str, plots: dict[str, float | None]) -> r
     )
     return rrb.Blueprint(
         rrb.Horizontal(
-            rrb.Vertical(map_view, health, row_shares=[4.5, 1.0]),
+            rrb.Vertical(map_view, verdicts, health, row_shares=[4.5, 1.7, 1.0]),
             rrb.Vertical(*views, visible=bool(views)),
             column_shares=[1.5, 1.0],
         ),

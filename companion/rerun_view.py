@@ -35,7 +35,15 @@ _YELLOW, _ORANGE, _BLUE = 0xF0E442FF, 0xE69F00FF, 0x4678DCFF
 _WHITE, _LIGHT, _GREY = 0xF0F0F0FF, 0xBEB9AAFF, 0x787878FF
 _OTHER_ESTIMATORS = (_PURPLE, _YELLOW, _BLUE, _ORANGE)
 _ANCHORS = (_SKY, _ORANGE, _GREEN, _PURPLE, _YELLOW, _VERMILION, _BLUE)
-_VERDICTS = {Verdict.ACCEPTED: _GREEN, Verdict.GATED: _VERMILION, Verdict.SUSPECT: _ORANGE}
+_VERDICTS = {
+    Verdict.ACCEPTED: _GREEN,
+    Verdict.DOWNWEIGHTED: _YELLOW,
+    Verdict.SUSPECT: _ORANGE,
+    Verdict.TOO_LONG: _VERMILION,
+    Verdict.WEAK_FIRST_PATH: _PURPLE,
+    Verdict.OBSTRUCTED: _SKY,
+    Verdict.GATED: _BLUE,
+}
 _STATES = {State.STARTING: _GREY, State.OK: _GREEN, State.DEGRADED: _ORANGE, State.LOST: _VERMILION}
 _LEVELS = {State.DEGRADED: "WARN", State.LOST: "ERROR"}
 
@@ -150,6 +158,7 @@ class RerunView:
         if self._frames:
             self._send_ranges(track)
             self._send_residuals()
+            self._send_verdicts()
         self._send_health()
         if self._truths:
             truth_ns = np.array([truth.stamp_ns for truth in self._truths])
@@ -263,10 +272,31 @@ class RerunView:
         lines = np.stack([tag, anchors[:, :2]], axis=1)
         drawn = np.isfinite(lines).all(axis=(1, 2))
         colours = _rgba([_VERDICTS.get(verdict, _GREY) for verdict in verdicts])
+        reasons = np.array(["" if verdict.is_used else str(verdict) for verdict in verdicts])
         self._static("map/ranges", rr.LineStrips2D.from_fields(radii=_screen(1.0), draw_order=10.0))
-        columns = rr.LineStrips2D.columns(strips=lines[drawn], colors=colours[drawn])
+        columns = rr.LineStrips2D.columns(strips=lines[drawn], colors=colours[drawn], labels=reasons[drawn])
         lengths = np.bincount(row[drawn], minlength=len(counts))
         self._columns("map/ranges", stamps_ns, columns.partition(lengths))
+
+    def _send_verdicts(self) -> None:
+        """A lane for each anchor: the verdict on its ranges, and with it the reason why one was rejected."""
+        for i in self._config.anchors:
+            given = [
+                (frame.stamp_ns, verdict)
+                for frame, report in self._frames
+                for anchor_id, verdict in zip(frame.anchor_ids.tolist(), report.verdicts, strict=False)
+                if anchor_id == i
+            ]
+            changes = [new for k, new in enumerate(given) if k == 0 or new[1] is not given[k - 1][1]]
+            style = rr.StateConfiguration(
+                values=list(Verdict),
+                labels=list(Verdict),
+                colors=_rgba([_VERDICTS.get(verdict, _GREY) for verdict in Verdict]),
+            )
+            self._static(f"ranges/verdict/A{i}", style)
+            stamps_ns = np.array([stamp_ns for stamp_ns, _ in changes])
+            states = rr.StateChange.columns(state=[verdict for _, verdict in changes])
+            self._columns(f"ranges/verdict/A{i}", stamps_ns, states)
 
     def _send_residuals(self) -> None:
         """Residual and NIS of each anchor, as far as the primary reports them."""

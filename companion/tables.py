@@ -38,6 +38,19 @@ def accuracy_table(result: Replay, title: str) -> Table:
     return table
 
 
+def anchor_table(result: Replay) -> Table:
+    """What the primary estimator made of the ranges of each anchor."""
+    by_anchor = result.anchor_verdicts[result.names[0]]
+    given = [verdict for verdict in Verdict if any(counts[verdict] for counts in by_anchor.values())]
+    table = Table(title=f"ranges by {result.names[0]}", title_justify="left")
+    table.add_column("anchor", no_wrap=True)
+    for verdict in given:
+        table.add_column(verdict, justify="right", max_width=14)
+    for anchor_id, counts in sorted(by_anchor.items()):
+        table.add_row(f"A{anchor_id}", *(str(counts[verdict]) for verdict in given))
+    return table
+
+
 def sensor_lines(result: Replay) -> list[str]:
     """What the decoders counted and what became of the measurements, a line each."""
     lines = [

@@ -10,7 +10,8 @@ import numpy as np
 from companion.estimator_choice import chosen_settings, split_choice
 from companion.evaluate import Errors, Reference, compare
 from companion.log import Truth
-from companion.pipeline import Chain, Pipeline
+from companion.pipeline import Chain, Outcome, Pipeline
+from companion.range_score import RangeScore, TrueExcess
 from companion.sim.measurements import MeasuredWalk, measure, setup_of
 from companion.sim.scenario import Scenario, load_scenario
 from companion.sim.simulate import START_NS, converse
@@ -19,7 +20,7 @@ from estimators.base import Estimator, Report, Setup, Verdict
 from estimators.bounds import landmark_information, posterior_bound, range_information
 from estimators.lidar.dead_reckoning import DeadReckoning
 from estimators.lidar.scan_matching import ScanMatcher
-from estimators.messages import Measurement, PoseEstimate
+from estimators.messages import Measurement, PoseEstimate, RangeFrame
 
 UWB_ALONE, LIDAR_ALONE = "uwb_ls", "lidar"
 """The single sensors: `least_squares` on ranges alone; increments added up from the true start."""
@@ -46,6 +47,7 @@ class TrialFigures:
         bound_ratio: `rmse_m` over the posterior Cramer-Rao bound; None when that is not known.
         settled_s: time from the first motion, or from the last kidnapping, until the pose stays within
             `RIGHT_WITHIN` to the end [s]; infinite when it does not, or has no heading.
+        ranges: what became of blocked and of clean ranges.
     """
 
     rmse_m: float
@@ -62,6 +64,7 @@ class TrialFigures:
     update_us: tuple[float, float]
     bound_ratio: float | None
     settled_s: float
+    ranges: RangeScore
 
 
 def run_trial(
@@ -86,17 +89,27 @@ def run_trial(
     timed = {choice: _TimedEstimator(_make(scenario, setup, choice)) for choice in choices}
     poses: dict[str, list[PoseEstimate]] = {choice: [] for choice in choices}
     bound: float | None = None
+    excess = TrueExcess(1.0 / scenario.file.uwb.rate)
     if scenario.file.increments is not None:
         walk = measure(scenario)
         bound = _bound(scenario, setup, walk)
-        truths, instants = _step_through(walk, timed, poses)
+        for frame, by_anchor in zip(walk.range_frames, walk.excess, strict=True):
+            excess.note(frame.stamp_ns, by_anchor)
+        truths, instants, outcomes = _step_through(walk, timed, poses)
     else:
-        truths, instants = _run_chain(scenario, timed, poses)
+        truths, instants, outcomes = _run_chain(scenario, timed, poses, excess)
+    scores = _scores(choices, outcomes, excess, scenario.file.uwb.sigma)
     reference = Reference(truths)
     covered = sum(reference.covers(stamp_ns) for stamp_ns in instants)
     sought_ns = _sought_since(truths, kidnapped=bool(scenario.file.kidnap))
     return {
-        choice: _figures(compare(poses[choice], reference, covered), timed[choice].seconds, bound, sought_ns)
+        choice: _figures(
+            compare(poses[choice], reference, covered),
+            timed[choice].seconds,
+            bound,
+            sought_ns,
+            scores[choice],
+        )
         for choice in choices
     }
 
@@ -134,37 +147,56 @@ def _make(scenario: Scenario, setup: Setup, choice: str) -> Estimator:
 
 def _step_through(
     walk: MeasuredWalk, estimators: Mapping[str, Estimator], poses: Mapping[str, list[PoseEstimate]]
-) -> tuple[list[Truth], list[int]]:
+) -> tuple[list[Truth], list[int], list[Outcome]]:
     """Measurements straight into the estimators; poses at the end of every step."""
+    outcomes: list[Outcome] = []
     instants: list[int] = walk.stamps_ns.tolist()
     waiting = iter(walk.in_order())
     following = next(waiting, None)
     for stamp_ns in instants:
         while following is not None and following.stamp_ns <= stamp_ns:
-            for estimator in estimators.values():
-                estimator.update(following)
+            reports = {choice: estimator.update(following) for choice, estimator in estimators.items()}
+            outcomes.append(Outcome(following, reports))
             following = next(waiting, None)
         _note({label: estimator.pose_at(stamp_ns) for label, estimator in estimators.items()}, poses)
-    return [Truth(stamp_ns, pose) for stamp_ns, pose in zip(instants, walk.poses, strict=True)], instants
+    truths = [Truth(stamp_ns, pose) for stamp_ns, pose in zip(instants, walk.poses, strict=True)]
+    return truths, instants, outcomes
 
 
 def _run_chain(
-    scenario: Scenario, estimators: Mapping[str, Estimator], poses: Mapping[str, list[PoseEstimate]]
-) -> tuple[list[Truth], list[int]]:
+    scenario: Scenario,
+    estimators: Mapping[str, Estimator],
+    poses: Mapping[str, list[PoseEstimate]],
+    excess: TrueExcess,
+) -> tuple[list[Truth], list[int], list[Outcome]]:
     """The whole chain from emulated bytes on, in memory; poses at its ticks."""
     config = scenario.config
     front_end = ScanMatcher(config.scan_matcher, config.lidar_mounting())
     chain = Chain(config, START_NS, Pipeline(front_end, estimators), next(iter(estimators)))
     truths: list[Truth] = []
     instants: list[int] = []
-    for item in converse(scenario, chain.sensors):
+    outcomes: list[Outcome] = []
+    for item in converse(scenario, chain.sensors, excess.note):
         if isinstance(item, Truth):
             truths.append(item)
             continue
         for tick in chain.feed(item):
             instants.append(tick.stamp_ns)
+            outcomes += tick.outcomes
             _note(tick.poses, poses)
-    return truths, instants
+    return truths, instants, outcomes
+
+
+def _scores(
+    choices: Sequence[str], outcomes: list[Outcome], excess: TrueExcess, sigma: float
+) -> dict[str, RangeScore]:
+    scores = {choice: RangeScore() for choice in choices}
+    for outcome in outcomes:
+        if isinstance(outcome.measurement, RangeFrame):
+            too_long = excess.of(outcome.measurement)
+            for choice, report in outcome.reports.items():
+                scores[choice].note(too_long, sigma, report)
+    return scores
 
 
 def _note(now: Mapping[str, PoseEstimate | None], poses: Mapping[str, list[PoseEstimate]]) -> None:
@@ -220,7 +252,7 @@ def _settled(errors: Errors, since_ns: int) -> float:
 
 
 def _figures(
-    errors: Errors, seconds: list[float], bound: float | None, sought_ns: int
+    errors: Errors, seconds: list[float], bound: float | None, sought_ns: int, ranges: RangeScore
 ) -> TrialFigures | None:
     accuracy = errors.accuracy()
     if accuracy is None:
@@ -244,4 +276,5 @@ def _figures(
         update_us=(median, p99),
         bound_ratio=accuracy.rmse / bound if bound is not None else None,
         settled_s=_settled(errors, sought_ns),
+        ranges=ranges,
     )

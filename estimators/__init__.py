@@ -54,5 +54,5 @@ def make_estimator(
         and isinstance(estimator, Settable)
         and isinstance(config, RangeGate.Config)
     ):
-        return Recovering(estimator, relocation, RangeGate(config, setup), setup)
+        return Recovering(estimator, relocation, config.range_sigma, setup)
     return estimator

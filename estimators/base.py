@@ -16,7 +16,15 @@ class Verdict(StrEnum):
     GATED = "gated"
     """Too far from the prediction (NIS above the gate)."""
     SUSPECT = "suspect"
-    """Near the prediction, but its anchor was gated a moment ago: it may still be blocked."""
+    """Near the prediction, but its anchor was blocked a moment ago and probably still is."""
+    TOO_LONG = "NLOS: longer than predicted"
+    """Its anchor is probably blocked, and this range is too long for the pose."""
+    WEAK_FIRST_PATH = "NLOS: weak first path"
+    """Its anchor is probably blocked, and its first path is much weaker than all that was received."""
+    OBSTRUCTED = "NLOS: obstacle in the line of sight"
+    """Its anchor is probably blocked, and the LiDAR sees an obstacle on the way to it."""
+    DOWNWEIGHTED = "down-weighted"
+    """Used, though with a larger sigma: it is more likely too long than not."""
     UNKNOWN_ANCHOR = "unknown anchor"
     """The site file has no anchor with this id."""
     IMPOSSIBLE = "impossible"
@@ -34,6 +42,19 @@ class Verdict(StrEnum):
     NOT_USED = "not used"
     """This estimator has no use for such a measurement."""
 
+    @property
+    def is_nlos(self) -> bool:
+        """Whether a range was rejected because something probably blocks it."""
+        return self in _NLOS
+
+    @property
+    def is_used(self) -> bool:
+        """Whether the measurement changed the estimate."""
+        return self in _USED
+
+
+_NLOS = frozenset({Verdict.SUSPECT, Verdict.TOO_LONG, Verdict.WEAK_FIRST_PATH, Verdict.OBSTRUCTED})
+_USED = frozenset({Verdict.ACCEPTED, Verdict.DOWNWEIGHTED})
 
 _EMPTY = np.empty(0)
 

@@ -15,8 +15,8 @@ from estimators.range_gate import RangeGate
 class Ekf(LidarOdometry):
     """LiDAR odometry held in place by tightly coupled UWB ranges.
 
-    Every range corrects the state on its own, through the lever arm and after height reduction, when it
-    passes the NIS gate. The state is that of `LidarOdometry`.
+    Every range corrects the state on its own, through the lever arm and after height reduction, when
+    `RangeGate` lets it pass. The state is that of `LidarOdometry`.
 
     Source: chen2019 Eq. (5)-(20); the paper's state and Jacobians are lost, those here are ours and
     are tested against finite differences.
@@ -31,7 +31,7 @@ class Ekf(LidarOdometry):
         super().__init__(config, setup)
 
     def update(self, measurement: Measurement) -> Report:
-        """Predict to the measurement's time and take it; ranges, landmarks and increments are used."""
+        """Predict to the measurement's time and take it; scans only show what blocks ranges."""
         if isinstance(measurement, RangeFrame):
             if self._is_late(measurement.stamp_ns):
                 return Report((Verdict.LATE,) * len(measurement.ranges))
@@ -42,7 +42,9 @@ class Ekf(LidarOdometry):
                 return Report((Verdict.LATE,))
             self._predict_to(measurement.stamp_ns)
             return Report((self._update_landmarks(measurement),))
-        return super().update(measurement)
+        report = super().update(measurement)
+        self._gate.see(measurement, self.pose_at)
+        return report
 
     def _place(self, pose: FloatArray, cov: FloatArray) -> None:
         super()._place(pose, cov)
@@ -52,20 +54,22 @@ class Ekf(LidarOdometry):
         count = len(frame.ranges)
         verdicts = [Verdict.ACCEPTED] * count
         residuals, nis = np.full(count, np.nan), np.full(count, np.nan)
-        for i, item in enumerate(self._gate.horizontal(frame)):
-            if isinstance(item, Verdict):
-                verdicts[i] = item
+        for i, candidate in enumerate(self._gate.candidates(frame, self._filter.x[POSE])):
+            if isinstance(candidate, Verdict):
+                verdicts[i] = candidate
                 continue
-            anchor, measured, sigma = item
-            predicted, by_pose = horizontal_range(self._filter.x[POSE], anchor, self._setup.tag_in_body)
+            measured, sigma = candidate.measured, candidate.sigma
+            predicted, by_pose = horizontal_range(
+                self._filter.x[POSE], candidate.anchor, self._setup.tag_in_body
+            )
             H = np.zeros((1, 9))
             H[0, POSE] = by_pose
             variance = float((H @ self._filter.P @ H.T).item()) + sigma**2
             residuals[i] = measured - predicted
             nis[i] = residuals[i] ** 2 / variance
-            verdicts[i] = self._gate.judge(int(frame.anchor_ids[i]), frame.stamp_ns, float(nis[i]))
-            if verdicts[i] is Verdict.ACCEPTED:
-                self._correct(residuals[i : i + 1], H, np.array([[sigma**2]]))
+            verdicts[i], factor = self._gate.judge(candidate, residuals[i], nis[i])
+            if verdicts[i].is_used:
+                self._correct(residuals[i : i + 1], H, np.array([[(factor * sigma) ** 2]]))
         return Report(tuple(verdicts), residuals, nis)
 
     def _update_landmarks(self, frame: LandmarkFrame) -> Verdict:

@@ -27,7 +27,7 @@ from estimators.messages import (
     RangeFrame,
 )
 from estimators.models.motion import constant_velocity
-from estimators.range_gate import RangeGate
+from estimators.range_gate import Candidate, RangeGate
 
 POSE, VELOCITY, KEYFRAME = slice(0, 3), slice(3, 6), slice(6, 9)
 _NO_RANGES, _NO_LANDMARKS = np.empty((0, 4)), np.empty((0, 6))
@@ -90,7 +90,7 @@ class ParticleCloud(KeyframeTracker):
         return self._particles.copy(), self._weights.copy()
 
     def update(self, measurement: Measurement) -> Report:
-        """Predict to the measurement's time and take it; ranges, landmarks and increments are used."""
+        """Predict to the measurement's time and take it; scans only show what blocks ranges."""
         if isinstance(measurement, RangeFrame):
             if self._is_late(measurement.stamp_ns):
                 return Report((Verdict.LATE,) * len(measurement.ranges))
@@ -101,7 +101,9 @@ class ParticleCloud(KeyframeTracker):
                 return Report((Verdict.LATE,))
             self._predict_to(measurement.stamp_ns)
             return Report((self._update_landmarks(measurement),))
-        return super().update(measurement)
+        report = super().update(measurement)
+        self._gate.see(measurement, self.pose_at)
+        return report
 
     def pose_at(self, stamp_ns: int) -> PoseEstimate | None:
         """Mean and covariance, predicted with constant velocity; None before the first measurement."""
@@ -164,42 +166,39 @@ class ParticleCloud(KeyframeTracker):
         count = len(frame.ranges)
         verdicts = [Verdict.ACCEPTED] * count
         innovations, nis = np.full(count, np.nan), np.full(count, np.nan)
-        used: list[int] = []
-        rows: list[tuple[float, ...]] = []
-        for i, item in enumerate(self._gate.horizontal(frame)):
+        candidates: dict[int, Candidate] = {}
+        pose, _ = self._cloud.moments(self._particles, self._weights, 3)
+        for i, item in enumerate(self._gate.candidates(frame, pose)):
             if isinstance(item, Verdict):
                 verdicts[i] = item
             else:
-                anchor, measured, sigma = item
-                used.append(i)
-                rows.append((anchor[0], anchor[1], measured, sigma))
-        if not used:
+                candidates[i] = item
+        if not candidates:
             return Report(tuple(verdicts), innovations, nis)
-        ids: list[int] = frame.anchor_ids[used].tolist()
-        ranges = np.array(rows)
-        doubted = np.array([self._gate.doubts(anchor_id, frame.stamp_ns) for anchor_id in ids])
-        innovations[used], nis[used], misfits = self._likelihood.gated_misfits(
-            self._particles, self._weights, self._arm, ranges, _NO_LANDMARKS, self._gate.limit, doubted
-        )
-        for k, i in enumerate(used):
-            verdicts[i] = self._gate.judge(ids[k], frame.stamp_ns, float(nis[i]))
-        if Verdict.ACCEPTED in verdicts:
-            self._take(misfits, Fixes(self._likelihood.misfits, self._arm, ranges, _NO_LANDMARKS))
+        ranges = np.array([(c.anchor[0], c.anchor[1], c.measured, c.sigma) for c in candidates.values()])
+        mean, cov = self._likelihood.expected_residuals(self._particles, self._weights, self._arm, ranges)
+        for k, (i, candidate) in enumerate(candidates.items()):
+            innovations[i] = mean[k]
+            nis[i] = mean[k] ** 2 / (cov[k, k] + candidate.sigma**2)
+            verdicts[i], factor = self._gate.judge(candidate, innovations[i], nis[i])
+            if not verdicts[i].is_used:
+                ranges[k, 3] = np.inf
+                continue
+            # What is used corrects the expectation of those after it, as in a Kalman filter.
+            ranges[k, 3] *= factor
+            gain = cov[:, k] / (cov[k, k] + ranges[k, 3] ** 2)
+            mean, cov = mean - gain * mean[k], cov - np.outer(gain, cov[k])
+        if any(verdict.is_used for verdict in verdicts):
+            fixes = Fixes(self._likelihood.misfits, self._arm, ranges, _NO_LANDMARKS)
+            self._take(fixes(self._particles), fixes)
         return Report(tuple(verdicts), innovations, nis)
 
     def _update_landmarks(self, frame: LandmarkFrame) -> Verdict:
         landmarks = self._landmark_gate.usable(frame)
         if isinstance(landmarks, Verdict):
             return landmarks
-        doubted = np.zeros(2 * len(landmarks), dtype=np.bool_)
-        _, _, misfits = self._likelihood.gated_misfits(
-            self._particles,
-            self._weights,
-            self._arm,
-            _NO_RANGES,
-            landmarks,
-            self._landmark_gate.limit,
-            doubted,
+        _, misfits = self._likelihood.gated_misfits(
+            self._particles, self._weights, landmarks, self._landmark_gate.limit
         )
         if np.isinf(landmarks[:, 4]).all():
             return Verdict.GATED

@@ -29,6 +29,8 @@ class MeasuredWalk:
         increments: K, each from the instant before; the first only founds the reference.
         range_frames: in stamp order.
         unblocked: for every range frame the anchors whose range came straight.
+        excess: for every range frame by how much what stands between makes the range of each anchor too long
+            [m].
         landmark_frames: in stamp order.
     """
 
@@ -37,6 +39,7 @@ class MeasuredWalk:
     increments: list[PoseIncrement]
     range_frames: list[RangeFrame]
     unblocked: list[list[int]]
+    excess: list[dict[int, float]]
     landmark_frames: list[LandmarkFrame]
 
     def in_order(self) -> list[PoseIncrement | RangeFrame | LandmarkFrame]:
@@ -64,13 +67,14 @@ def measure(scenario: Scenario) -> MeasuredWalk:
     assert odometry is not None
     odometry_rng, uwb_rng, landmark_rng = scenario.rng.spawn(3)
     stamps_ns, poses = _instants(scenario, odometry.rate)
-    range_frames, unblocked = _range_frames(scenario, uwb_rng)
+    range_frames, unblocked, excess = _range_frames(scenario, uwb_rng)
     return MeasuredWalk(
         stamps_ns=stamps_ns,
         poses=poses,
         increments=_increments(odometry, odometry_rng, stamps_ns, poses, scenario.file.kidnap),
         range_frames=range_frames,
         unblocked=unblocked,
+        excess=excess,
         landmark_frames=_landmark_frames(scenario, landmarks, landmark_rng) if landmarks else [],
     )
 
@@ -125,19 +129,22 @@ def _increments(
     return increments
 
 
-def _range_frames(scenario: Scenario, rng: np.random.Generator) -> tuple[list[RangeFrame], list[list[int]]]:
-    """Ranges that err as those of the emulated tag do, and the anchors that it saw."""
-    uwb, config, world = scenario.file.uwb, scenario.config, scenario.world
+def _range_frames(
+    scenario: Scenario, rng: np.random.Generator
+) -> tuple[list[RangeFrame], list[list[int]], list[dict[int, float]]]:
+    """Ranges that err as those of the emulated tag do, the anchors that it saw, and what NLOS added."""
+    uwb, config = scenario.file.uwb, scenario.config
     stamps_ns, poses = _instants(scenario, uwb.rate)
     ids = np.array(list(config.anchors), dtype=np.int64)
     anchors = np.array(list(config.anchors.values()))
     lever_arm = np.array(config.body.tag)
     tag_height = np.full(len(poses), config.body.height + lever_arm[2])
     tags = np.column_stack([transform_each(poses, lever_arm[None, :2]), tag_height])
-    clear = np.array([world.line_of_sight(tag, anchors) for tag in tags])
+    seconds = ((stamps_ns - START_NS) * 1e-9).tolist()
+    clear = np.array([scenario.sees(tag, t) for tag, t in zip(tags, seconds, strict=True)])
     distances = np.linalg.norm(anchors - tags[:, None], axis=2)
     distances += draw_delay_biases(uwb, len(ids), rng)
-    drawn = draw_ranging(uwb, distances, clear, rng)
+    drawn = draw_ranging(uwb, distances, clear, rng, rng.spawn(1)[0])
     frames = [
         RangeFrame(
             stamp_ns,
@@ -149,7 +156,8 @@ def _range_frames(scenario: Scenario, rng: np.random.Generator) -> tuple[list[Ra
         )
         for k, (stamp_ns, got) in enumerate(zip(stamps_ns.tolist(), drawn.received, strict=True))
     ]
-    return frames, [ids[row].tolist() for row in clear & drawn.received]
+    excess = [dict(zip(config.anchors, row, strict=True)) for row in drawn.excess.tolist()]
+    return frames, [ids[row].tolist() for row in clear & drawn.received], excess
 
 
 def _landmark_frames(

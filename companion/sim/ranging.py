@@ -16,12 +16,14 @@ class Ranging:
 
     Attributes:
         ranges: [m], slant.
+        excess: how much too long what stands between made it [m]; 0 in line of sight.
         received: False where the ranging failed.
         rx_power: [dBm], of everything received.
         fp_power: [dBm], of the first path.
     """
 
     ranges: FloatArray
+    excess: FloatArray
     received: NDArray[np.bool_]
     rx_power: FloatArray
     fp_power: FloatArray
@@ -43,7 +45,11 @@ def draw_delay_biases(uwb: UwbTable, count: int, rng: np.random.Generator) -> Fl
 
 
 def draw_ranging(
-    uwb: UwbTable, distances: FloatArray, clear: NDArray[np.bool_], rng: np.random.Generator
+    uwb: UwbTable,
+    distances: FloatArray,
+    clear: NDArray[np.bool_],
+    rng: np.random.Generator,
+    power_rng: np.random.Generator,
 ) -> Ranging:
     """Ranges over true distances.
 
@@ -52,15 +58,19 @@ def draw_ranging(
         distances: [m], of any shape.
         clear: of the same shape; False where something stands between.
         rng: source of noise.
+        power_rng: that of the powers.
     """
     noise = rng.standard_normal(distances.shape) * uwb.sigma
-    excess = uwb.nlos_least + rng.exponential(uwb.nlos_mean, distances.shape)
+    excess = np.where(clear, 0.0, uwb.nlos_least + rng.exponential(uwb.nlos_mean, distances.shape))
     received = rng.random(distances.shape) >= uwb.dropout
     # Free-space loss; what is blocked loses more, most of all on its first path.
     rx_power = -72.0 - 20.0 * np.log10(np.maximum(distances, 0.1)) - np.where(clear, 0.0, 6.0)
+    weaker = np.where(clear, uwb.power_difference, uwb.nlos_power_difference)
+    weaker += uwb.power_sigma * power_rng.standard_normal(distances.shape)
     return Ranging(
-        ranges=distances + noise + np.where(clear, 0.0, excess),
+        ranges=distances + noise + excess,
+        excess=excess,
         received=received,
         rx_power=rx_power,
-        fp_power=rx_power - np.where(clear, 2.0, 11.0),
+        fp_power=rx_power - np.maximum(weaker, 0.0),
     )

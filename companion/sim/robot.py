@@ -1,9 +1,14 @@
 """Where the simulated robot is at any instant."""
 
+from collections.abc import Callable
+from typing import TypeAlias
+
 import numpy as np
 
 from companion.sim.scenario import Scenario
 from companion.sim.trajectory import Motion
+
+OnRanging: TypeAlias = Callable[[int, dict[int, float]], None]
 
 
 class Robot:
@@ -11,10 +16,13 @@ class Robot:
 
     Args:
         scenario: walk and world.
+        on_ranging: is told of every UWB frame, whether or not it arrives: its time, and by how much what
+            stands between makes the range of each anchor too long [m].
     """
 
-    def __init__(self, scenario: Scenario) -> None:
+    def __init__(self, scenario: Scenario, on_ranging: OnRanging = lambda _stamp_ns, _excess: None) -> None:
         self.scenario = scenario
+        self.on_ranging = on_ranging
         self._begin_ns: int | None = None
 
     def begin(self, now_ns: int) -> None:

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Literal, Self
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from companion.config import Config, Coordinate, Table, known, load_config, parse_toml, read_text, validated
@@ -13,16 +14,19 @@ from companion.sim.gait import GaitTrajectory
 from companion.sim.kidnap import Kidnapped, Walk
 from companion.sim.lidar_models import LIDAR_MODELS
 from companion.sim.scenario_tables import (
+    Blockade,
     GaitTable,
     IncrementsTable,
     KidnapTable,
     LandmarksTable,
+    NlosTable,
     PaperTable,
     RandomBoxesTable,
     RandomWaypointsTable,
 )
 from companion.sim.trajectory import Trajectory
 from companion.sim.world import World
+from estimators.messages import FloatArray
 
 
 class BoxTable(Table):
@@ -84,6 +88,11 @@ class UwbTable(Table):
     nlos_least: float = Field(0.2, ge=0, le=10, description="least bias of a blocked range [m]")
     nlos_mean: float = Field(0.3, ge=0, le=10, description="mean of the exponential bias on top of that [m]")
     dropout: float = Field(0.02, ge=0, lt=1, description="share of ranges that fail")
+    power_difference: float = Field(
+        3.0, ge=0, le=60, description="mean by which the first path is weaker than everything received [dB]"
+    )
+    nlos_power_difference: float = Field(11.0, ge=0, le=60, description="the same of a blocked range [dB]")
+    power_sigma: float = Field(2.0, ge=0, le=20, description="standard deviation of both [dB]")
 
 
 class LidarTable(Table):
@@ -141,6 +150,7 @@ class ScenarioFile(Table):
     imu: ImuTable = Field(default_factory=ImuTable)
     faults: list[FaultTable] = Field(default_factory=list)
     kidnap: list[KidnapTable] = Field(default_factory=list)
+    nlos: list[NlosTable] = Field(default_factory=list)
     gait: GaitTable | None = None
     increments: IncrementsTable | None = None
     landmarks: LandmarksTable | None = None
@@ -165,6 +175,7 @@ class Scenario:
         seed: of everything random in it.
         world: walls and boxes.
         trajectory: the true walk; its start is displaced as the site's start sigma says, if it is known.
+        blockades: anchors that are not seen for a while, whatever stands where.
         rng: where the sensors draw their noise from.
     """
 
@@ -174,7 +185,21 @@ class Scenario:
     seed: int
     world: World
     trajectory: Walk
+    blockades: list[Blockade]
     rng: np.random.Generator
+
+    def sees(self, tag: FloatArray, seconds: float) -> NDArray[np.bool_]:
+        """Which anchors (A,), in the order of the site file, are in line of sight.
+
+        Args:
+            tag: (3,) [m], map frame.
+            seconds: since the walk began.
+        """
+        clear = self.world.line_of_sight(tag, np.array(list(self.config.anchors.values())))
+        for blockade in self.blockades:
+            if blockade.begin <= seconds < blockade.end:
+                clear &= ~blockade.blocked
+        return clear
 
 
 def load_scenario(path: Path, seed: int | None, sets: list[str]) -> Scenario:
@@ -219,6 +244,12 @@ def load_scenario(path: Path, seed: int | None, sets: list[str]) -> Scenario:
     )
     for table in file.world.random_boxes:
         boxes += table.draw(rng)
+    for i, blocked in enumerate(file.nlos):
+        if blocked.anchors > len(config.anchors):
+            raise UserError(
+                f"{path}: nlos.{i}.anchors: the site has {len(config.anchors)} anchors, got {blocked.anchors}"
+            )
+    blockades = [table.draw(len(config.anchors), rng) for table in file.nlos]
     trajectory: Walk = GaitTrajectory(straight, walk.rest, file.gait, rng) if file.gait else straight
     if start.known and walk.random:
         raise UserError(
@@ -242,5 +273,6 @@ def load_scenario(path: Path, seed: int | None, sets: list[str]) -> Scenario:
         seed=seed,
         world=World([list(wall) for wall in config.site.walls], boxes),
         trajectory=trajectory,
+        blockades=blockades,
         rng=rng,
     )

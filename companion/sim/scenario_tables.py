@@ -1,14 +1,17 @@
 """Further tables of scenario files: random obstacles, gait, measurements without bytes, published figures."""
 
+from dataclasses import dataclass
 from typing import Annotated, Self
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from companion.config import Coordinate, Table
 
 Box = tuple[float, float, float, float, float, float]
 Interval = tuple[Coordinate, Coordinate]
+Seconds = Annotated[float, Field(ge=0, le=86_400)]
 Figure = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
 
@@ -93,6 +96,41 @@ class KidnapTable(Table):
         if self.to is None and (self.x is None or self.y is None):
             raise ValueError("to: give a pose, or x and y between which to draw one")
         return self
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Blockade:
+    """Anchors that are not seen for a while.
+
+    Attributes:
+        blocked: (A,) True for these, in the order of the site file.
+        begin: since the walk began [s].
+        end: likewise.
+    """
+
+    blocked: NDArray[np.bool_]
+    begin: float
+    end: float
+
+
+class NlosTable(Table):
+    """Something that no LiDAR sees stands before some anchors for a while; others in every trial."""
+
+    anchors: int = Field(ge=1, description="how many at once")
+    at: tuple[Seconds, Seconds] = Field(description="begins between these times since the walk began [s]")
+    duration: float = Field(10.0, gt=0, le=3600, description="[s]")
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        if self.at[0] > self.at[1]:
+            raise ValueError(f"at: earliest {self.at[0]:g} is above latest {self.at[1]:g}")
+        return self
+
+    def draw(self, anchors: int, rng: np.random.Generator) -> Blockade:
+        """What is blocked, of so many anchors, in one trial."""
+        begin = rng.uniform(*self.at)
+        blocked = np.isin(np.arange(anchors), rng.permutation(anchors)[: self.anchors])
+        return Blockade(blocked, begin, begin + self.duration)
 
 
 class GaitTable(Table):

@@ -6,7 +6,7 @@ from pathlib import Path
 from companion.log import Direction, LogWriter, RawChunk, Truth
 from companion.pipeline import make_sensors
 from companion.sim.devices import make_lines
-from companion.sim.robot import Robot
+from companion.sim.robot import OnRanging, Robot
 from companion.sim.scenario import Scenario
 from drivers.framing import Sensor
 from estimators.messages import Scan
@@ -19,7 +19,11 @@ TRUTH_EVERY = 5
 """Steps from one true pose to the next in the log: 50 Hz."""
 
 
-def converse(scenario: Scenario, sensors: Mapping[str, Sensor]) -> Iterator[RawChunk | Truth]:
+def converse(
+    scenario: Scenario,
+    sensors: Mapping[str, Sensor],
+    on_ranging: OnRanging = lambda _stamp_ns, _excess: None,
+) -> Iterator[RawChunk | Truth]:
     """Everything that crosses the ports while the robot walks, and the truth.
 
     The caller feeds the incoming chunks to `sensors`, whose dialogue this function carries out.
@@ -27,8 +31,9 @@ def converse(scenario: Scenario, sensors: Mapping[str, Sensor]) -> Iterator[RawC
     Args:
         scenario: to run from `START_NS` until the walk is over.
         sensors: the drivers, by the site's sensor names.
+        on_ranging: as `Robot` has it.
     """
-    robot = Robot(scenario)
+    robot = Robot(scenario, on_ranging)
     lines = make_lines(robot, START_NS)
     open_ports: set[str] = set()
     step, now_ns = 0, START_NS

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from companion.sim.ranging import draw_delay_biases
+from companion.sim.ranging import draw_delay_biases, draw_ranging
 from companion.sim.robot import Robot
 from companion.sim.scenario import ImuTable, UwbTable
 from companion.sim.trajectory import Motion
@@ -64,6 +64,7 @@ class LinkTrackDevice:
     def __init__(self, robot: Robot, rng: np.random.Generator) -> None:
         self._robot = robot
         self._rng = rng
+        self._power_rng = rng.spawn(1)[0]
         self._uwb: UwbTable = robot.scenario.file.uwb
         self._imu: ImuTable = robot.scenario.file.imu
         config = robot.scenario.config
@@ -127,7 +128,7 @@ class LinkTrackDevice:
 
     def _frame(self, stamp_ns: int) -> Frame:
         motion = self._robot.motion(stamp_ns)
-        nodes = self._ranges(motion.pose[0])
+        nodes = self._ranges(motion.pose[0], stamp_ns)
         clock_ms = self._clock_ms(stamp_ns)
         sender: dict[str, Any] = {
             "id": self._id,
@@ -206,23 +207,22 @@ class LinkTrackDevice:
             anchors=tuple(positions.get(i, (None, None, None)) for i in range(10)),
         )
 
-    def _ranges(self, pose: FloatArray) -> tuple[NodeRange, ...]:
+    def _ranges(self, pose: FloatArray, stamp_ns: int) -> tuple[NodeRange, ...]:
         tag = np.array([*transform(pose, self._tag[None, :2])[0], self._height + self._tag[2]])
-        clear = self._robot.scenario.world.line_of_sight(tag, self._anchors)
+        clear = self._robot.scenario.sees(tag, self._robot.seconds(stamp_ns))
         distances = np.linalg.norm(self._anchors - tag, axis=1) + self._biases
-        noise = self._rng.standard_normal(len(distances)) * self._uwb.sigma
-        excess = self._uwb.nlos_least + self._rng.exponential(self._uwb.nlos_mean, len(distances))
-        failed = self._rng.random(len(distances)) < self._uwb.dropout
-        ranges = distances + noise + np.where(clear, 0.0, excess)
-        # Free-space loss; what is blocked loses more, most of all on its first path.
-        received = -72.0 - 20.0 * np.log10(np.maximum(distances, 0.1)) - np.where(clear, 0.0, 6.0)
-        first_path = received - np.where(clear, 2.0, 11.0)
+        drawn = draw_ranging(self._uwb, distances, clear, self._rng, self._power_rng)
+        self._robot.on_ranging(stamp_ns, dict(zip(self._anchor_ids, drawn.excess.tolist(), strict=True)))
         return tuple(
             NodeRange(
-                Role.ANCHOR, anchor_id, max(float(ranges[i]), 0.001), float(first_path[i]), float(received[i])
+                Role.ANCHOR,
+                anchor_id,
+                max(float(drawn.ranges[i]), 0.001),
+                float(drawn.fp_power[i]),
+                float(drawn.rx_power[i]),
             )
             for i, anchor_id in enumerate(self._anchor_ids)
-            if not failed[i]
+            if drawn.received[i]
         )
 
     def _gyro(self, yaw_rate: float) -> list[float]:

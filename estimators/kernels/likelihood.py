@@ -1,16 +1,12 @@
 """Measurements held against particles: residuals, gate and weights."""
 
 from math import atan2, cos, exp, sin, sqrt
-from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from estimators.kernels.algebra import wrapped
 from estimators.kernels.compilation import MATRIX, VECTOR, compiled, inlined
 from estimators.messages import FloatArray
-
-BoolArray: TypeAlias = NDArray[np.bool_]
 
 
 @inlined
@@ -58,35 +54,38 @@ def residuals(poses: FloatArray, arm: FloatArray, ranges: FloatArray, landmarks:
 
 
 @inlined
-def _innovations(
-    residuals: FloatArray, weights: FloatArray, sigmas: FloatArray, gate: float, doubted: BoolArray
-) -> tuple[FloatArray, FloatArray]:
-    """Innovation and NIS (K,) of measurements, each after those before it that pass the gate.
-
-    The cloud's residuals are taken for Gaussian: an accepted one corrects the expectation of the others by
-    their covariance, as a Kalman filter's sequential update would.
-    """
-    count = residuals.shape[1]
+def _moments(values: FloatArray, weights: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Mean (K,) and the lower triangle of the covariance (K, K) of weighted values (N, K)."""
+    count = values.shape[1]
     mean, cov = np.zeros(count), np.zeros((count, count))
-    for i in range(len(residuals)):
+    for i in range(len(values)):
         for j in range(count):
-            mean[j] += weights[i] * residuals[i, j]
-    for i in range(len(residuals)):
+            mean[j] += weights[i] * values[i, j]
+    for i in range(len(values)):
         for j in range(count):
-            deviation = weights[i] * (residuals[i, j] - mean[j])
+            deviation = weights[i] * (values[i, j] - mean[j])
             for k in range(j + 1):
-                cov[j, k] += deviation * (residuals[i, k] - mean[k])
-    nis = np.empty(count)
-    for j in range(count):
-        cov[j, j] += sigmas[j] * sigmas[j]
-        nis[j] = mean[j] * mean[j] / cov[j, j]
-        if nis[j] <= gate and not doubted[j]:
-            for k in range(j + 1, count):
-                gain = cov[k, j] / cov[j, j]
-                mean[k] -= gain * mean[j]
-                for m in range(j + 1, k + 1):
-                    cov[k, m] -= gain * cov[m, j]
-    return mean, nis
+                cov[j, k] += deviation * (values[i, k] - mean[k])
+    return mean, cov
+
+
+@compiled(f"Tuple(({VECTOR}, {MATRIX}))({MATRIX}, {VECTOR}, {VECTOR}, {MATRIX})")
+def expected_residuals(
+    particles: FloatArray, weights: FloatArray, arm: FloatArray, ranges: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Measured minus predicted ranges as the cloud expects them: mean (M,) [m] and covariance (M, M) [m^2].
+
+    Args:
+        particles: (N, 9).
+        weights: (N,) that sum to one.
+        arm: (3,) tag antenna in the body frame [m].
+        ranges: (M, 4).
+    """
+    mean, cov = _moments(residuals(particles, arm, ranges, np.empty((0, 6))), weights)
+    for j in range(len(cov)):
+        for k in range(j):
+            cov[k, j] = cov[j, k]
+    return mean, cov
 
 
 @inlined
@@ -132,43 +131,42 @@ def misfits(particles: FloatArray, arm: FloatArray, ranges: FloatArray, landmark
     return _half_squares(residuals(particles, arm, ranges, landmarks), _sigmas(ranges, landmarks))
 
 
-@compiled(
-    f"Tuple(({VECTOR}, {VECTOR}, {VECTOR}))"
-    f"({MATRIX}, {VECTOR}, {VECTOR}, {MATRIX}, {MATRIX}, float64, boolean[::1])"
-)
+@compiled(f"Tuple(({VECTOR}, {VECTOR}))({MATRIX}, {VECTOR}, {MATRIX}, float64)")
 def gated_misfits(
-    particles: FloatArray,
-    weights: FloatArray,
-    arm: FloatArray,
-    ranges: FloatArray,
-    landmarks: FloatArray,
-    gate: float,
-    doubted: BoolArray,
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """As `misfits`, of the measurements that pass their gate; the sigmas of the others become infinite.
+    particles: FloatArray, weights: FloatArray, landmarks: FloatArray, gate: float
+) -> tuple[FloatArray, FloatArray]:
+    """As `misfits`, of the landmarks that pass their gate; the sigmas of the others become infinite.
+
+    The cloud's residuals are taken for Gaussian: an accepted one corrects the expectation of the others by
+    their covariance, as a Kalman filter's sequential update would.
 
     Args:
         particles: (N, 9).
         weights: (N,) that sum to one.
-        arm: (3,) tag antenna in the body frame [m].
-        ranges: (M, 4); sigmas are changed in place.
-        landmarks: (L, 6), likewise; range and bearing of a landmark pass together or not at all.
+        landmarks: (L, 6), sigmas are changed in place; range and bearing pass together or not at all.
         gate: greatest NIS that passes.
-        doubted: (M + 2 L,) True where a measurement does not count whatever its NIS.
 
     Returns:
-        Innovations and NIS, both (M + 2 L,), each after the measurements before it; misfits (N,).
+        NIS (2 L,), each after the measurements before it; misfits (N,).
     """
-    values = residuals(particles, arm, ranges, landmarks)
-    innovations, nis = _innovations(values, weights, _sigmas(ranges, landmarks), gate, doubted)
-    for j in range(len(ranges)):
-        if doubted[j] or not nis[j] <= gate:
-            ranges[j, 3] = np.inf
+    no_ranges = np.empty((0, 4))
+    values = residuals(particles, np.zeros(3), no_ranges, landmarks)
+    mean, cov = _moments(values, weights)
+    sigmas = _sigmas(no_ranges, landmarks)
+    nis = np.empty(len(mean))
+    for j in range(len(mean)):
+        cov[j, j] += sigmas[j] * sigmas[j]
+        nis[j] = mean[j] * mean[j] / cov[j, j]
+        if nis[j] <= gate:
+            for k in range(j + 1, len(mean)):
+                gain = cov[k, j] / cov[j, j]
+                mean[k] -= gain * mean[j]
+                for m in range(j + 1, k + 1):
+                    cov[k, m] -= gain * cov[m, j]
     for j in range(len(landmarks)):
-        k = len(ranges) + 2 * j
-        if not (nis[k] <= gate and nis[k + 1] <= gate):
+        if not (nis[2 * j] <= gate and nis[2 * j + 1] <= gate):
             landmarks[j, 4] = landmarks[j, 5] = np.inf
-    return innovations, nis, _half_squares(values, _sigmas(ranges, landmarks))
+    return nis, _half_squares(values, _sigmas(no_ranges, landmarks))
 
 
 @inlined

@@ -8,7 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from estimators.base import Report, Settable, Setup, Verdict
 from estimators.geometry import compose, inverse
 from estimators.messages import FloatArray, Measurement, PoseEstimate, PoseIncrement, RangeFrame
-from estimators.range_gate import RangeGate
+from estimators.range_gate import HorizontalRanges
 from estimators.relocation.search import Minimum, find_pose, lies_outside, too_short, total_loss
 from estimators.relocation.window import PlacedRanges, Window
 
@@ -44,7 +44,7 @@ class Recovering:
     Args:
         wrapped: the filter.
         config: of the search.
-        gate: as the filter's, for the noise of its ranges.
+        range_sigma: standard deviation of a range, as the filter's [m].
         setup: geometry of the site.
     """
 
@@ -73,12 +73,12 @@ class Recovering:
             0.65, ge=0.5, le=1, description="least share of ranges that agree with a found pose"
         )
 
-    def __init__(self, wrapped: Settable, config: Config, gate: RangeGate, setup: Setup) -> None:
+    def __init__(self, wrapped: Settable, config: Config, range_sigma: float, setup: Setup) -> None:
         self._wrapped = wrapped
         self._config = config
         self._period_ns = round(config.period * 1e9)
         self._starts_known = setup.start.known
-        self._window = Window(config.window, gate, setup.tag_in_body)
+        self._window = Window(config.window, HorizontalRanges(range_sigma, setup), setup.tag_in_body)
         self.reset()
 
     def reset(self) -> None:

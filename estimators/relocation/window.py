@@ -9,7 +9,7 @@ from estimators.base import Verdict
 from estimators.geometry import compose, inverse, transform, transform_each, wrap_angle
 from estimators.lidar.keyframes import is_covariance
 from estimators.messages import FloatArray, IntArray, PoseIncrement, RangeFrame
-from estimators.range_gate import RangeGate
+from estimators.range_gate import HorizontalRanges
 
 LONGEST_STEP_NS = 500_000_000
 """Ranges between two poses further apart than this have no place on the way."""
@@ -76,13 +76,13 @@ class Window:
 
     Args:
         length: how far back ranges are kept [s].
-        gate: reduces ranges to the horizontal.
+        horizontal: reduces ranges to the horizontal.
         tag_in_body: (3,) [m].
     """
 
-    def __init__(self, length: float, gate: RangeGate, tag_in_body: FloatArray) -> None:
+    def __init__(self, length: float, horizontal: HorizontalRanges, tag_in_body: FloatArray) -> None:
         self._length_ns = round(length * 1e9)
-        self._gate = gate
+        self._horizontal = horizontal
         self._arm = tag_in_body[None, :2]
         self.clear()
 
@@ -114,7 +114,7 @@ class Window:
             return [Verdict.LATE] * len(frame.ranges)
         verdicts: list[Verdict] = []
         rows: list[tuple[float, ...]] = []
-        for anchor_id, item in zip(frame.anchor_ids.tolist(), self._gate.horizontal(frame), strict=True):
+        for anchor_id, item in zip(frame.anchor_ids.tolist(), self._horizontal.of(frame), strict=True):
             if isinstance(item, Verdict):
                 verdicts.append(item)
             else:

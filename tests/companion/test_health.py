@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from companion.config import HealthTable
-from companion.health import HealthMonitor, State
+from companion.health import HealthMonitor, State, uwb_line
 from estimators.base import Report, Verdict
 from estimators.messages import FloatArray, PoseEstimate, PoseIncrement, RangeFrame
 
@@ -117,11 +117,12 @@ def test_a_range_that_is_too_short_is_an_alarm_where_a_long_one_is_none(
 def test_a_lost_pose_must_agree_better_than_one_that_is_kept() -> None:
     # Two of five: enough to go on, not enough to begin.
     verdicts = (*(Verdict.ACCEPTED,) * 2, *(Verdict.GATED,) * 3)
+    ones = np.ones(5)
     kept, lost = monitor_at(5.0), monitor_at(5.0)
     go_on(lost, 5, 15, Verdict.GATED)
     for monitor, begin in ((kept, 5), (lost, 15)):
         for stamp_ns in range(begin * SECOND, (begin + 20) * SECOND, SECOND // 10):
-            monitor.observe(ranges(stamp_ns), Report(verdicts))
+            monitor.observe(RangeFrame(stamp_ns, 1, np.arange(5), ones, ones, ones), Report(verdicts))
             monitor.observe(increment(stamp_ns), Report((Verdict.ACCEPTED,)))
     assert state(kept, 25.0, pose()) is State.OK
     assert state(lost, 35.0, pose()) is State.LOST
@@ -174,3 +175,49 @@ def test_what_an_estimator_lacks_is_told_to_the_operator() -> None:
     )
     monitor.observe(ranges(5 * SECOND), Report((Verdict.ACCEPTED,) * 4))
     assert monitor.judge(None, 5 * SECOND).reason == "no pose yet: waiting for measurements"
+
+
+@pytest.mark.parametrize(
+    ("verdict", "expected"),
+    [
+        (Verdict.TOO_LONG, State.LOST),
+        (Verdict.DOWNWEIGHTED, State.LOST),
+        (Verdict.SUSPECT, State.OK),
+        (Verdict.WEAK_FIRST_PATH, State.OK),
+        (Verdict.OBSTRUCTED, State.OK),
+    ],
+)
+def test_what_is_too_long_speaks_against_the_pose_and_what_only_stands_in_the_way_does_not(
+    verdict: Verdict, expected: State
+) -> None:
+    monitor = monitor_at(5.0)
+    report = Report((Verdict.ACCEPTED, verdict, verdict, verdict), np.full(4, 0.5), np.zeros(4))
+    # One of four agrees, below `min_accepted_share`.
+    for stamp_ns in range(5 * SECOND, 25 * SECOND, SECOND // 10):
+        monitor.observe(ranges(stamp_ns), report)
+        monitor.observe(increment(stamp_ns), Report((Verdict.ACCEPTED,)))
+    assert state(monitor, 25.0, pose()) is expected
+
+
+def test_the_operator_hears_which_anchors_are_used_and_why_the_others_are_not() -> None:
+    monitor = HealthMonitor(HealthTable.model_validate({}), True, True, anchor_ids=[0, 1, 2, 3, 7])
+    assert (
+        uwb_line(monitor.anchors(0))
+        == "UWB: 0 of 5 anchors, A0 silent, A1 silent, A2 silent, A3 silent, A7 silent"
+    )
+    good, bad = Verdict.ACCEPTED, Verdict.WEAK_FIRST_PATH
+    monitor.observe(ranges(SECOND), Report((good, Verdict.DOWNWEIGHTED, good, Verdict.IMPOSSIBLE)))
+    monitor.observe(ranges(2 * SECOND), Report((good, Verdict.DOWNWEIGHTED, bad, Verdict.GATED)))
+    now_ns = 2 * SECOND + SECOND // 10
+    assert uwb_line(monitor.anchors(now_ns)) == "UWB: 2 of 5 anchors, A2 NLOS, A3 gated, A7 silent"
+    assert [anchor.reason for anchor in monitor.anchors(now_ns)] == ["", "", bad, Verdict.GATED, ""]
+    # One range that was used a moment ago is enough: a single outlier is no news.
+    assert monitor.anchors(SECOND + SECOND // 2)[2].is_used
+    assert not any(anchor.is_used or anchor.reason for anchor in monitor.anchors(10 * SECOND))
+
+
+def test_an_estimator_without_use_for_ranges_leaves_the_anchors_silent() -> None:
+    monitor = HealthMonitor(HealthTable.model_validate({}), True, True, anchor_ids=[0, 1])
+    frame = RangeFrame(SECOND, 1, np.arange(2), np.ones(2), np.ones(2), np.ones(2))
+    monitor.observe(frame, Report((Verdict.NOT_USED,) * 2))
+    assert uwb_line(monitor.anchors(SECOND)) == "UWB: 0 of 2 anchors, A0 silent, A1 silent"

@@ -129,9 +129,13 @@ def test_ranges_go_from_tag_to_anchor_in_the_colour_of_their_verdict(run: Run, r
     # The first frames come before the first pose: there is no tag yet to draw them from.
     hidden = len(verdicts) - len(colours)
     assert 0 < hidden < 20
-    expected = {Verdict.ACCEPTED: GREEN, Verdict.GATED: VERMILION, Verdict.SUSPECT: ORANGE}
-    assert colours == [expected[verdict] for verdict in verdicts[hidden:]]
-    assert set(colours) == {GREEN, VERMILION, ORANGE}
+    expected = {Verdict.ACCEPTED: GREEN, Verdict.TOO_LONG: VERMILION, Verdict.SUSPECT: ORANGE}
+    told = [(c, v) for c, v in zip(colours, verdicts[hidden:], strict=True) if v in expected]
+    assert [colour for colour, _ in told] == [expected[verdict] for _, verdict in told]
+    assert len(set(colours)) == len(set(verdicts[hidden:])), "a colour for every reason"
+    labels = [label for row in recording["map/ranges"]["LineStrips2D:labels"] for label in row]
+    assert labels == ["" if verdict.is_used else verdict for verdict in verdicts[hidden:]]
+    assert Verdict.TOO_LONG in labels
 
     ends = np.array([strip[1] for row in recording["map/ranges"]["LineStrips2D:strips"] for strip in row])
     anchors = np.array(list(run.config.anchors.values()))[:, :2]
@@ -148,8 +152,26 @@ def test_plots_hold_errors_residuals_nis_and_gate(run: Run, recording: Recording
         assert len(recording[f"ranges/residual/A{anchor}"]["Scalars:scalars"]) > 100
     ((gate,), _) = recording["ranges/nis/gate"]["Scalars:scalars"]
     nis = [v for i in run.config.anchors for (v,) in recording[f"ranges/nis/A{i}"]["Scalars:scalars"]]
-    passed = sum(verdict in (Verdict.ACCEPTED, Verdict.SUSPECT) for verdict in run.verdicts("ekf"))
-    assert sum(value <= gate for value in nis) == passed
+    accepted = run.verdicts("ekf").count(Verdict.ACCEPTED)
+    assert accepted <= sum(value <= gate for value in nis) < len(nis)
+
+
+def test_each_anchor_has_a_lane_with_the_changes_of_its_verdict(run: Run, recording: Recording) -> None:
+    reports = [
+        o.reports["ekf"]
+        for tick, _ in run.ticks
+        for o in tick.outcomes
+        if isinstance(o.measurement, RangeFrame)
+    ]
+    for i in run.config.anchors:
+        given = [
+            verdict
+            for frame, report in zip(run.measurements(RangeFrame), reports, strict=True)
+            for anchor_id, verdict in zip(frame.anchor_ids.tolist(), report.verdicts, strict=True)
+            if anchor_id == i
+        ]
+        changes = [b for a, b in zip([None, *given], given, strict=False) if a is not b]
+        assert [state for (state,) in recording[f"ranges/verdict/A{i}"]["StateChange:state"]] == changes
 
 
 def test_health_changes_are_a_state_and_a_line_of_text(run: Run, recording: Recording) -> None:

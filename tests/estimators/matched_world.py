@@ -39,7 +39,7 @@ def matched_config(range_gate: float = 1 - 1e-9) -> Ekf.Config:
     return Ekf.Config(
         range_sigma=RANGE_SIGMA,
         range_gate=range_gate,
-        suspect_for=0.0,
+        nlos=(),
         increment_gate=1 - 1e-9,
         accel_noise=ACCEL_NOISE,
         yaw_accel_noise=YAW_ACCEL_NOISE,

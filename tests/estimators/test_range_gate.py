@@ -1,58 +1,238 @@
-"""Which ranges are believed: height reduction, unknown anchors, the gate and doubt after it."""
+"""The range gate: which ranges it lets pass, why it rejects the others, and what filters make of it."""
+
+from dataclasses import replace
+from itertools import permutations
 
 import numpy as np
 import pytest
-from scipy.stats import chi2
 
-from estimators.base import Verdict
-from estimators.range_gate import RangeGate
-from tests.strategies import SETUP, range_frame
+from estimators import estimator_config_class, make_estimator
+from estimators.base import Setup, Start, Verdict
+from estimators.messages import FloatArray, PoseIncrement, RangeFrame
+from estimators.nlos.visibility import OBSTRUCTED, Visibility
+from estimators.range_gate import Candidate, NlosMethod, RangeGate
+from tests.estimators.matched_world import HALL, true_ranges
+from tests.strategies import range_frame
 
-SECOND_NS = 10**9
-
-
-def gate(**settings: float) -> RangeGate:
-    """Gate in the room of `SETUP`."""
-    return RangeGate(RangeGate.Config(**settings), SETUP)
-
-
-def test_ranges_are_reduced_to_the_horizontal_with_their_sigma_grown() -> None:
-    height = SETUP.height_to(SETUP.anchors[2])
-    (item,) = gate(range_sigma=0.1).horizontal(range_frame(0, [2], [float(np.hypot(3.0, height))]))
-    assert not isinstance(item, Verdict)
-    anchor, horizontal, sigma = item
-    np.testing.assert_array_equal(anchor, SETUP.anchors[2])
-    assert horizontal == pytest.approx(3.0)
-    assert sigma == pytest.approx(0.1 * np.hypot(3.0, height) / 3.0)
+SIGMA = 0.1
+STEP_NS = 40_000_000
+POSE = HALL.start.pose
+SURE = replace(HALL, start=Start(POSE, np.array([0.02, 0.02, 0.01]), still_for=60.0))
+CLEAR, WEAK, NO_POWER = 3.0, 11.0, np.nan
+"""Power of everything received above that of the first path [dB]."""
+EXPECTED_SIGMA = 0.11
+"""Of a residual: the range's and the prediction's [m]."""
 
 
-@pytest.mark.parametrize("slant", [float("nan"), float("inf"), -3.0, 0.0, 1.0])
-def test_what_is_no_range_is_impossible(slant: float) -> None:
-    # 1 m is shorter than the anchor is high above the tag.
-    assert list(gate().horizontal(range_frame(0, [1], [slant]))) == [Verdict.IMPOSSIBLE]
+def gate(*methods: NlosMethod) -> RangeGate:
+    return RangeGate(RangeGate.Config(range_sigma=SIGMA, nlos=methods), HALL)
 
 
-def test_an_anchor_that_the_site_does_not_have_is_unknown_whatever_its_range() -> None:
-    frame = range_frame(0, [99, 99], [float("nan"), 3.0])
-    assert list(gate().horizontal(frame)) == [Verdict.UNKNOWN_ANCHOR] * 2
+def frame_at(k: int, excess: FloatArray, difference: float | FloatArray = NO_POWER) -> RangeFrame:
+    """Ranges of a robot that stands at the start, too long by `excess` (4,)."""
+    frame = true_ranges(k * STEP_NS, POSE, HALL)
+    rx = np.full(4, -80.0)
+    return replace(frame, ranges=frame.ranges + excess, rx_power=rx, fp_power=rx - difference)
 
 
-def test_the_gate_passes_the_share_of_good_ranges_that_it_says() -> None:
-    limit = gate(range_gate=0.95).limit
-    assert limit == pytest.approx(float(chi2.ppf(0.95, 1)))
-    ranges = gate(range_gate=0.95)
-    assert ranges.judge(1, 0, limit) is Verdict.ACCEPTED
-    assert ranges.judge(1, 0, np.nextafter(limit, np.inf)) is Verdict.GATED
+def judged(of: RangeGate, k: int, residual: float, difference: float = NO_POWER) -> Verdict:
+    """Verdict on the first range of a frame."""
+    candidate = of.candidates(frame_at(k, np.zeros(4), difference), POSE)[0]
+    assert isinstance(candidate, Candidate)
+    verdict, _ = of.judge(candidate, residual, (residual / EXPECTED_SIGMA) ** 2)
+    return verdict
 
 
-def test_an_anchor_is_doubted_for_as_long_as_said_after_its_range_was_gated() -> None:
-    ranges = gate(suspect_for=0.5)
-    assert ranges.judge(1, 0, 1e3) is Verdict.GATED
-    assert ranges.doubts(1, SECOND_NS // 2 - 1)
-    assert ranges.judge(1, SECOND_NS // 2 - 1, 0.0) is Verdict.SUSPECT
-    assert ranges.judge(2, 1, 0.0) is Verdict.ACCEPTED
-    assert not ranges.doubts(1, SECOND_NS // 2)
-    assert ranges.judge(1, SECOND_NS // 2, 0.0) is Verdict.ACCEPTED
-    ranges.judge(1, SECOND_NS, 1e3)
-    ranges.reset()
-    assert ranges.judge(1, SECOND_NS, 0.0) is Verdict.ACCEPTED
+def obstruct(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The LiDAR sees an obstacle on every line."""
+    monkeypatch.setattr(Visibility, "log_ratio", lambda *_: OBSTRUCTED)
+
+
+def test_without_methods_the_nis_decides_both_ways() -> None:
+    plain = gate()
+    assert judged(plain, 0, 0.3, WEAK) is Verdict.ACCEPTED
+    assert judged(plain, 1, 0.4) is Verdict.GATED
+    assert judged(plain, 2, -0.4) is Verdict.GATED
+    assert judged(plain, 3, 0.3) is Verdict.ACCEPTED
+
+
+def test_a_range_that_is_too_long_is_named_so_and_its_anchor_remembered() -> None:
+    remembering = gate("prediction")
+    assert judged(remembering, 0, 0.4) is Verdict.TOO_LONG
+    assert judged(remembering, 1, 0.25) is Verdict.TOO_LONG
+    assert judged(remembering, 2, 0.0) is Verdict.SUSPECT
+    assert judged(remembering, 200, 0.0) is Verdict.ACCEPTED
+
+
+def test_an_anchor_that_was_long_clear_is_not_doubted_for_one_outlier() -> None:
+    remembering = gate("prediction")
+    for k in range(50):
+        assert judged(remembering, k, 0.0) is Verdict.ACCEPTED
+    assert judged(remembering, 50, 0.4) is Verdict.TOO_LONG
+    assert judged(remembering, 51, 0.0) is Verdict.ACCEPTED
+
+
+def test_a_small_excess_shows_when_it_lasts() -> None:
+    remembering = gate("prediction")
+    for k in range(50):
+        judged(remembering, k, 0.0)
+    verdicts = [judged(remembering, k, 0.25) for k in range(50, 60)]
+    assert verdicts[0] is Verdict.ACCEPTED
+    assert set(verdicts[-5:]) == {Verdict.TOO_LONG}
+
+
+def test_a_range_that_is_too_short_is_gated_and_says_nothing_of_its_anchor() -> None:
+    for methods in (("prediction",), ("robust",), ("prediction", "power", "visibility")):
+        of = gate(*methods)
+        for k in range(20):
+            assert judged(of, k, -0.4) is Verdict.GATED
+        assert judged(of, 20, 0.0) is Verdict.ACCEPTED
+
+
+def test_powers_alone_reject_where_the_vendor_calls_a_blocked_range_likely() -> None:
+    alone = gate("power")
+    assert judged(alone, 0, 0.0, 10.0) is Verdict.WEAK_FIRST_PATH
+    assert judged(alone, 1, 0.0, 9.5) is Verdict.ACCEPTED
+    assert judged(alone, 2, 0.0, NO_POWER) is Verdict.ACCEPTED
+    assert judged(alone, 3, 0.4, CLEAR) is Verdict.GATED
+
+
+def test_an_obstacle_alone_rejects(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert judged(gate("visibility"), 0, 0.0) is Verdict.ACCEPTED
+    obstruct(monkeypatch)
+    assert judged(gate("visibility"), 0, 0.0) is Verdict.OBSTRUCTED
+
+
+def test_a_low_box_and_a_weak_first_path_reject_no_range_that_agreed_all_the_time(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    obstruct(monkeypatch)
+    combined = gate("prediction", "power", "visibility")
+    verdicts = [judged(combined, k, 0.0, WEAK) for k in range(40)]
+    assert Verdict.ACCEPTED not in verdicts[:1]
+    assert set(verdicts[5:]) == {Verdict.ACCEPTED}
+    # ... but it takes less to reject one: alone, such a residual is nothing.
+    assert judged(combined, 40, 0.22, WEAK) is Verdict.OBSTRUCTED
+    plain = gate("prediction")
+    for k in range(40):
+        judged(plain, k, 0.0)
+    assert judged(plain, 40, 0.22) is Verdict.ACCEPTED
+
+
+def test_the_reason_is_what_speaks_most(monkeypatch: pytest.MonkeyPatch) -> None:
+    methods: tuple[NlosMethod, ...] = ("prediction", "power", "visibility")
+    assert judged(gate(*methods), 0, 0.32, WEAK) is Verdict.TOO_LONG
+    assert judged(gate(*methods), 0, 0.2, WEAK) is Verdict.WEAK_FIRST_PATH
+    obstruct(monkeypatch)
+    assert judged(gate(*methods), 0, 0.2, WEAK) is Verdict.OBSTRUCTED
+
+
+def test_the_order_of_the_names_means_nothing() -> None:
+    rng = np.random.default_rng(0)
+    rows = [(float(rng.normal(0.1, 0.2)), float(rng.choice([CLEAR, WEAK]))) for _ in range(200)]
+    orders: list[tuple[NlosMethod, ...]] = list(permutations(("prediction", "power", "robust")))
+    runs = [[judged(gate_, k, *row) for k, row in enumerate(rows)] for gate_ in (gate(*o) for o in orders)]
+    assert len(set(runs[0])) > 1
+    assert all(run == runs[0] for run in runs)
+
+
+def test_robust_uses_every_range_that_is_not_too_short_but_counts_the_long_ones_less() -> None:
+    soft = gate("robust")
+    factors = []
+    for k, residual in enumerate((0.0, 0.2, 0.4, 2.0)):
+        candidate = soft.candidates(frame_at(k, np.zeros(4)), POSE)[0]
+        assert isinstance(candidate, Candidate)
+        verdict, factor = soft.judge(candidate, residual, (residual / EXPECTED_SIGMA) ** 2)
+        assert verdict is (Verdict.DOWNWEIGHTED if residual >= 0.4 else Verdict.ACCEPTED)
+        factors.append(factor)
+    assert factors == sorted(factors)
+    assert 1.0 <= factors[0] < 1.1
+    assert factors[-1] > 50.0
+
+
+@pytest.mark.parametrize("methods", [("prediction",), ("prediction", "power"), ("prediction", "robust")])
+def test_biased_ranges_go_and_clean_ones_stay(methods: tuple[NlosMethod, ...]) -> None:
+    rng = np.random.default_rng(4)
+    of = gate(*methods)
+    rejected: dict[bool, list[bool]] = {True: [], False: []}
+    for k in range(3000):
+        blocked = k // 250 % 2 == 1
+        excess = 0.2 + rng.exponential(0.3) if blocked else 0.0
+        residual = excess + SIGMA * rng.standard_normal()
+        difference = (WEAK if blocked else CLEAR) + 2.0 * rng.standard_normal()
+        verdict = judged(of, k, residual, difference)
+        if not blocked or excess > 3.0 * SIGMA:
+            rejected[blocked].append(verdict is not Verdict.ACCEPTED)
+    assert np.mean(rejected[True]) > 0.98
+    assert np.mean(rejected[False]) < 0.03
+
+
+def test_what_is_no_range_says_what_is_wrong() -> None:
+    frame = true_ranges(0, POSE, HALL)
+    bad = replace(
+        frame,
+        anchor_ids=np.array([10, 11, 12, 99]),
+        ranges=np.array([np.nan, -3.0, 0.5, 5.0]),
+    )
+    wrong = Verdict.IMPOSSIBLE
+    assert gate("prediction").candidates(bad, POSE) == [wrong, wrong, wrong, Verdict.UNKNOWN_ANCHOR]
+
+
+FILTERS = ["ekf", "pf", "pf_ibas"]
+
+
+def stand(
+    name: str, excess: FloatArray, frames: int, setup: Setup = SURE, **settings: object
+) -> tuple[list[tuple[Verdict, ...]], FloatArray, FloatArray]:
+    """Verdicts, pose (3,) and its covariance after so many frames at the start, with exact odometry."""
+    config = estimator_config_class(name).model_validate(settings)
+    estimator = make_estimator(name, config, setup)
+    verdicts = []
+    tight = np.diag([1e-6, 1e-6, 1e-7])
+    for k in range(frames):
+        increment = PoseIncrement(
+            0, k * STEP_NS, np.zeros(3), tight if k else 0.0 * tight, is_keyframe=k == 0
+        )
+        estimator.update(increment)
+        verdicts.append(estimator.update(frame_at(k, excess)).verdicts)
+    pose = estimator.pose_at(frames * STEP_NS)
+    assert pose is not None
+    return verdicts, np.array([*pose.xy, pose.yaw]), pose.planar_cov
+
+
+@pytest.mark.parametrize("name", FILTERS)
+@pytest.mark.parametrize("methods", [["prediction"], ["prediction", "robust"]], ids=str)
+def test_every_filter_keeps_its_pose_while_half_of_the_anchors_are_blocked(
+    name: str, methods: list[str]
+) -> None:
+    verdicts, pose, _ = stand(name, np.array([0.5, 0.0, 0.0, 0.8]), 50, nlos=methods)
+    good, bad = Verdict.ACCEPTED, Verdict.DOWNWEIGHTED if "robust" in methods else Verdict.TOO_LONG
+    assert set(verdicts[5:]) == {(bad, good, good, bad)}
+    assert np.hypot(*(pose - POSE)[:2]) < 0.05
+    _, led_astray, _ = stand(name, np.array([0.25, 0.0, 0.0, 0.25]), 50, nlos=[])
+    assert np.hypot(*(led_astray - POSE)[:2]) > 0.05
+
+
+@pytest.mark.parametrize("name", FILTERS)
+@pytest.mark.parametrize("excess", [4.0, np.nan, -30.0], ids=str)
+def test_ten_seconds_without_a_range_to_believe_leave_a_pose_whose_doubt_grows(
+    name: str, excess: float
+) -> None:
+    moving = replace(SURE, start=Start(POSE, SURE.start.sigma, still_for=0.0))
+    config = estimator_config_class(name).model_validate({"particles": 50} if name == "pf" else {})
+    estimator = make_estimator(name, config, moving)
+    sigmas = []
+    for k in range(250):
+        stamp_ns = (k if k % 50 != 49 else k - 5) * STEP_NS
+        report = estimator.update(replace(frame_at(0, np.full(4, excess)), stamp_ns=stamp_ns))
+        if k < 50:
+            assert Verdict.ACCEPTED not in report.verdicts
+        estimator.update(range_frame(stamp_ns, [], []))
+        pose = estimator.pose_at(stamp_ns)
+        assert pose is not None
+        assert np.isfinite(pose.T_map_body).all()
+        assert np.linalg.eigvalsh(pose.planar_cov)[0] > 0.0
+        sigmas.append(float(np.sqrt(np.trace(pose.planar_cov[:2, :2]))))
+    assert sigmas[24] < sigmas[48]
+    if not np.isfinite(excess) or excess < 0.0:
+        assert sigmas[48] < sigmas[148] < sigmas[248]

@@ -87,9 +87,9 @@ def test_power_tells_blocked_from_free(tmp_path: Path) -> None:
     setup = scenario(tmp_path)
     frames = [m for m in decoder().feed(run_tag(setup, 8.0, 10_000_000), 0) if isinstance(m, RangeFrame)]
     difference = np.concatenate([frame.rx_power - frame.fp_power for frame in frames])
-    # LinkTrack manual: below 6 dB line of sight is likely, above 10 dB it is not.
-    assert set(np.unique(difference > 8.0)) == {True, False}
-    assert ((difference < 6.0) | (difference > 10.0)).all()
+    # LinkTrack manual: below 6 dB line of sight is likely, above 10 dB it is not, between it is open.
+    assert (difference < 6.0).sum() > (difference > 10.0).sum() > 20
+    assert ((difference >= 6.0) & (difference <= 10.0)).mean() < 0.2
 
 
 def test_bytes_do_not_depend_on_how_often_they_are_asked_for(tmp_path: Path) -> None:

@@ -21,40 +21,44 @@ def test_residuals_and_misfits_are_those_of_numpy(seed: int) -> None:
 
 
 @SEEDS
-def test_gating_is_a_kalman_filters_sequential_update(seed: int) -> None:
+def test_residuals_are_expected_as_numpy_expects_them(seed: int) -> None:
     particles, weights = random_cloud(seed)
-    values = predicted(particles, RANGES, LANDMARKS)
+    values = predicted(particles, RANGES, LANDMARKS)[:, : len(RANGES)]
+    mean, cov = likelihood.expected_residuals(particles, weights, ARM, RANGES)
+    np.testing.assert_allclose(mean, weights @ values, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(cov, np.cov(values.T, aweights=weights, ddof=0), rtol=1e-8, atol=1e-9)
+
+
+@SEEDS
+def test_landmarks_are_gated_by_a_kalman_filters_sequential_update(seed: int) -> None:
+    particles, weights = random_cloud(seed)
+    values = predicted(particles, RANGES, LANDMARKS)[:, len(RANGES) :]
+    spreads = sigmas(RANGES, LANDMARKS)[len(RANGES) :]
+    count = len(spreads)
     mean = weights @ values
-    cov = (weights * (values - mean).T) @ (values - mean) + np.diag(sigmas(RANGES, LANDMARKS) ** 2)
-    doubted = np.array([False, True, False, False, False, False, False])
+    cov = (weights * (values - mean).T) @ (values - mean) + np.diag(spreads**2)
     gate, taken = 9.0, list[int]()
-    innovations, nis = np.empty(7), np.empty(7)
-    for j in range(7):
+    nis = np.empty(count)
+    for j in range(count):
         gain = cov[j, taken] @ np.linalg.inv(cov[np.ix_(taken, taken)]) if taken else np.zeros(0)
-        innovations[j] = mean[j] - gain @ mean[taken]
-        nis[j] = innovations[j] ** 2 / (cov[j, j] - gain @ cov[taken, j])
-        if nis[j] <= gate and not doubted[j]:
+        nis[j] = (mean[j] - gain @ mean[taken]) ** 2 / (cov[j, j] - gain @ cov[taken, j])
+        if nis[j] <= gate:
             taken.append(j)
-    ranges, landmarks = RANGES.copy(), LANDMARKS.copy()
-    found = likelihood.gated_misfits(particles, weights, ARM, ranges, landmarks, gate, doubted)
-    np.testing.assert_allclose(found[0], innovations, rtol=1e-8, atol=1e-9)
-    np.testing.assert_allclose(found[1], nis, rtol=1e-8)
+    landmarks = LANDMARKS.copy()
+    found, misfits = likelihood.gated_misfits(particles, weights, landmarks, gate)
+    np.testing.assert_allclose(found, nis, rtol=1e-8)
     passed = nis <= gate
-    assert list(np.isfinite(ranges[:, 3])) == [bool(passed[0]), False, bool(passed[2])]
-    for row, j in zip(landmarks, (3, 5), strict=True):
-        assert np.isfinite(row[4:]).all() == (passed[j] and passed[j + 1])
-    np.testing.assert_allclose(
-        found[2], 0.5 * ((values / sigmas(ranges, landmarks)) ** 2).sum(axis=1), rtol=1e-9
-    )
+    for k, row in enumerate(landmarks):
+        assert np.isfinite(row[4:]).all() == (passed[2 * k] and passed[2 * k + 1])
+    used = sigmas(np.empty((0, 4)), landmarks)
+    np.testing.assert_allclose(misfits, 0.5 * ((values / used) ** 2).sum(axis=1), rtol=1e-9)
 
 
 def test_a_landmark_whose_bearing_fails_loses_its_range_too() -> None:
     particles, weights = random_cloud(0)
     landmarks = LANDMARKS[:1].copy()
     landmarks[0, 3] += 2.0
-    _, nis, misfits = likelihood.gated_misfits(
-        particles, weights, ARM, np.empty((0, 4)), landmarks, 16.0, np.zeros(2, dtype=bool)
-    )
+    nis, misfits = likelihood.gated_misfits(particles, weights, landmarks, 16.0)
     assert nis[0] < 16.0 < nis[1]
     assert np.isinf(landmarks[0, 4:]).all()
     np.testing.assert_array_equal(misfits, 0.0)

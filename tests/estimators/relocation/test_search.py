@@ -9,7 +9,7 @@ from scipy.stats import chi2
 
 from estimators.geometry import transform
 from estimators.messages import FloatArray, PoseIncrement, RangeFrame
-from estimators.range_gate import RangeGate
+from estimators.range_gate import HorizontalRanges
 from estimators.relocation.search import BLOCKED_LOSS, SHORT_LIMIT, find_pose, too_short, total_loss
 from estimators.relocation.window import PlacedRanges, Window
 from tests.estimators.matched_world import pose_error
@@ -20,7 +20,7 @@ BIAS_SIGMA = 0.05
 
 def placed_by(robot: Robot, seconds: float) -> tuple[PlacedRanges, FloatArray]:
     """Ranges of a walk, and where the newest keyframe really was."""
-    window = Window(5.0, RangeGate(RangeGate.Config(), ROOM), ROOM.tag_in_body)
+    window = Window(5.0, HorizontalRanges(0.1, ROOM), ROOM.tag_in_body)
     keyframe = robot.pose
     for _ in range(round(seconds * 10)):
         for measurement in robot.walk(0.1):

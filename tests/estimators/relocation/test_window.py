@@ -8,7 +8,7 @@ import pytest
 from estimators.base import Verdict
 from estimators.geometry import between, compose, transform
 from estimators.messages import FloatArray, Measurement, PoseIncrement, RangeFrame
-from estimators.range_gate import RangeGate
+from estimators.range_gate import HorizontalRanges
 from estimators.relocation.window import MOST_RANGES, Window
 from tests.estimators.relocation.wandering_robot import ROOM, SECOND_NS, Robot
 from tests.strategies import range_frame
@@ -17,7 +17,7 @@ SMALL = np.diag([1e-6, 1e-6, 1e-6])
 
 
 def window(length: float = 5.0) -> Window:
-    return Window(length, RangeGate(RangeGate.Config(), ROOM), ROOM.tag_in_body)
+    return Window(length, HorizontalRanges(0.1, ROOM), ROOM.tag_in_body)
 
 
 def step(from_tenths: int, to_tenths: int, x: float, is_keyframe: bool) -> PoseIncrement:
