@@ -60,11 +60,11 @@ def test_simulate_then_replay(tmp_path: Path) -> None:
     (tmp_path / "moved.toml").write_text(SITE_TEXT.replace("0.15, 6.85, 2.0", "0.15, 4.85, 2.0"))
     done = companion("replay", "a.mcap", "--site", "moved.toml", "--out", "moved", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    gated = [
-        json.loads((path / "summary.json").read_text())["estimators"]["ekf"]["verdicts"].get("gated", 0)
+    accepted = [
+        json.loads((path / "summary.json").read_text())["estimators"]["ekf"]["anchors"]["1"]["accepted"]
         for path in (folder, tmp_path / "moved")
     ]
-    assert gated[1] > 2 * gated[0]
+    assert accepted[1] < 0.5 * accepted[0]
 
 
 def test_replay_of_a_torn_log_says_so(short_log: Path, tmp_path: Path) -> None:
