@@ -108,11 +108,9 @@ class HealthMonitor:
         self._used_ns: dict[int, int] = {}
         self._has_ranges = has_ranges
         self._has_scans = has_scans
-        # Nothing is believed before ranges have agreed with the start pose for a while.
-        self._accepted_share = 0.0
-        self._short_share = 0.0
-        self._agrees = False
+        self._resets = 0
         self._has_agreed = False
+        self._begin_agreement()
         self._share_stamp_ns: int | None = None
         self._range_ns: int | None = None
         self._increment_ns: int | None = None
@@ -148,6 +146,11 @@ class HealthMonitor:
         self._short_share = keep * self._short_share + (1.0 - keep) * too_short / judged
         self._share_stamp_ns = stamp_ns
         self._judge_agreement()
+
+    def _begin_agreement(self) -> None:
+        """No pose is believed, at the start or after a reset, before ranges agreed with it for a while."""
+        self._accepted_share = self._short_share = 0.0
+        self._agrees = False
 
     def _judge_agreement(self) -> None:
         """Whether ranges and pose agree; harder to reach than to keep, so that health does not flicker."""
@@ -190,6 +193,9 @@ class HealthMonitor:
         table = self._table
         if pose is None:
             return Health(State.STARTING, self._note or "no pose yet: waiting for measurements")
+        if pose.reset_counter != self._resets:
+            self._resets = pose.reset_counter
+            self._begin_agreement()
         sources = self._sources(now_ns)
         awaited = [s.what for s in sources if s.first_awaited and not s.is_stale]
         if awaited:
@@ -224,7 +230,8 @@ class HealthMonitor:
         )
         if self._has_agreed:
             return Health(State.LOST, shares)
-        return Health(State.STARTING, f"{shares}; is the robot on its start mark?")
+        on_mark = "" if self._resets else "; is the robot on its start mark?"
+        return Health(State.STARTING, shares + on_mark)
 
     def _sources(self, now_ns: int) -> list[_Source]:
         def source(what: str, seen_ns: int | None, limit: float) -> _Source:

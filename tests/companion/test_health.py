@@ -1,5 +1,7 @@
 """Health: what the pilot's autopilot gets, and what it does not."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -221,3 +223,17 @@ def test_an_estimator_without_use_for_ranges_leaves_the_anchors_silent() -> None
     frame = RangeFrame(SECOND, 1, np.arange(2), np.ones(2), np.ones(2), np.ones(2))
     monitor.observe(frame, Report((Verdict.NOT_USED,) * 2))
     assert uwb_line(monitor.anchors(SECOND)) == "UWB: 0 of 2 anchors, A0 silent, A1 silent"
+
+
+def test_after_a_reset_ranges_must_confirm_the_pose_before_it_is_sent_again() -> None:
+    monitor = monitor_at(5.0)
+    good = Report((Verdict.ACCEPTED,) * 4, np.zeros(4), np.zeros(4))
+    moved = replace(pose(), reset_counter=1)
+    states = []
+    for stamp_ns in range(5 * SECOND, 10 * SECOND, SECOND // 10):
+        monitor.observe(ranges(stamp_ns), good)
+        monitor.observe(increment(stamp_ns), Report((Verdict.ACCEPTED,)))
+        states.append(monitor.judge(pose() if stamp_ns < 7 * SECOND else moved, stamp_ns).state)
+    assert set(states[:20]) == {State.OK}
+    assert set(states[20:30]) == {State.LOST}
+    assert set(states[40:]) == {State.OK}

@@ -120,7 +120,7 @@ def test_ten_seconds_without_a_believed_range_leave_a_growing_covariance() -> No
     for k in range(101):
         stamp_ns = SECOND_NS + k * SECOND_NS // 10
         wrong = range_frame(stamp_ns, exact.anchor_ids.tolist(), (exact.ranges + 500.0).tolist())
-        assert pf.update(wrong).verdicts == (Verdict.GATED,) * 4
+        assert pf.update(wrong).verdicts == (Verdict.TOO_LONG,) * 4
         if k % 20 == 0:
             pose = pf.pose_at(stamp_ns)
             assert pose is not None
@@ -132,13 +132,13 @@ def test_ten_seconds_without_a_believed_range_leave_a_growing_covariance() -> No
     assert sigmas[-1][2] == pytest.approx(np.pi / np.sqrt(3.0), rel=0.1)
 
 
-def test_a_blocked_range_among_good_ones_is_gated_and_then_its_anchor_suspect() -> None:
+def test_a_blocked_range_among_good_ones_is_rejected_and_then_its_anchor_suspect() -> None:
     pf = standing()
     exact = true_ranges(SECOND_NS + 1, HALL.start.pose, HALL)
     blocked = range_frame(SECOND_NS + 1, exact.anchor_ids.tolist(), (exact.ranges + 1.5 * SECOND).tolist())
     good = Verdict.ACCEPTED
     report = pf.update(blocked)
-    assert report.verdicts == (good, Verdict.GATED, good, good)
+    assert report.verdicts == (good, Verdict.TOO_LONG, good, good)
     assert report.residuals[1] == pytest.approx(1.5, abs=0.1)
     again = pf.update(true_ranges(SECOND_NS + 2, HALL.start.pose, HALL))
     assert again.verdicts == (good, Verdict.SUSPECT, good, good)
