@@ -10,6 +10,7 @@ from estimators.base import Estimator, Setup
 ESTIMATORS: dict[str, tuple[str, str]] = {
     "ekf": ("estimators.ekf", "Ekf"),
     "least_squares": ("estimators.least_squares", "LeastSquares"),
+    "graph": ("estimators.graph.smoother", "GraphSmoother"),
     "lidar_odometry": ("estimators.lidar.odometry", "LidarOdometry"),
     "pf": ("estimators.particle_filter", "ParticleFilter"),
     "pf_ibas": ("estimators.pf_ibas", "PfIbas"),

@@ -14,7 +14,7 @@ from estimators.kernels.compilation import INDICES, MATRIX, VECTOR, compiled
 from estimators.messages import FloatArray, IntArray
 
 BLOCKS = "float64[:, :, ::1]"
-_LEAST_PIVOT = 1e-11
+_LEAST_PIVOT = 1e-12
 """Share of a diagonal element that elimination must leave; less is rounding, and the matrix singular."""
 
 

@@ -219,14 +219,15 @@ def linearise(
 
     Source: huang2024 Eq. (29)-(38); weights of robust losses: iteratively reweighted least squares.
     """
-    free, increments, ranges, sightings, motions, priors, dense, dense_at, dense_information, pull = graph
+    free, increments, ranges, sightings, motions, priors, dense, dense_at, dense_information, dense_pull = graph
     order, _, _, (slots_i, slots_r, slots_s, slots_m, slots_d) = system
     if with_system:
         gradient[:] = 0.0
         diagonal[:] = 0.0
         below[:] = 0.0
-    A, B, W, e = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3)
-    cost = 0.0
+    A, B, W = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
+    e, pull = np.zeros(3), np.zeros(3)
+    cost, c, s = 0.0, 1.0, 0.0
 
     for k in range(len(increments)):
         row = increments[k]
@@ -243,20 +244,42 @@ def linearise(
         rho, weight = loss(row[14], row[15], square, 1.0)
         cost += row[16] * rho
         if with_system:
+            # With residual and information turned into the map, one Jacobian is the identity.
+            w = row[16] * weight
+            for t in range(3):
+                A[0, t] = w * (c * row[5 + t] - s * row[8 + t])
+                A[1, t] = w * (s * row[5 + t] + c * row[8 + t])
+                A[2, t] = w * row[11 + t]
             for r in range(3):
-                for t in range(3):
-                    W[r, t] = row[16] * weight * row[5 + 3 * r + t]
-            B[0, 0], B[0, 1], B[0, 2] = c, s, 0.0
-            B[1, 0], B[1, 1], B[1, 2] = -s, c, 0.0
-            B[2, 0], B[2, 1], B[2, 2] = 0.0, 0.0, 1.0
-            A[:] = -B
-            A[0, 2], A[1, 2] = across, -along
-            _add(gradient, diagonal, below, order, i, j, slots_i[k], A, B, W, e, 3)
+                W[r, 0], W[r, 1], W[r, 2] = c * A[r, 0] - s * A[r, 1], s * A[r, 0] + c * A[r, 1], A[r, 2]
+                pull[r] = A[r, 0] * e[0] + A[r, 1] * e[1] + A[r, 2] * e[2]
+            for t in range(3):
+                B[0, t], B[1, t], B[2, t] = -W[0, t], -W[1, t], dy * W[0, t] - dx * W[1, t] - W[2, t]
+            p, q = order[i], order[j]
+            if p >= 0:
+                gradient[p, 0] -= pull[0]
+                gradient[p, 1] -= pull[1]
+                gradient[p, 2] += dy * pull[0] - dx * pull[1] - pull[2]
+                for r in range(3):
+                    diagonal[p, r, 0] -= B[r, 0]
+                    diagonal[p, r, 1] -= B[r, 1]
+                    diagonal[p, r, 2] += dy * B[r, 0] - dx * B[r, 1] - B[r, 2]
+            if q >= 0:
+                for r in range(3):
+                    gradient[q, r] += pull[r]
+                    for t in range(3):
+                        diagonal[q, r, t] += W[r, t]
+                        if p > q:
+                            below[slots_i[k], r, t] += B[r, t]
+                        elif p >= 0:
+                            below[slots_i[k], r, t] += B[t, r]
 
+    turned = -1
     for k in range(len(ranges)):
         row = ranges[k]
         i, j = int(row[0]), int(row[1])
-        c, s = cos(values[i, 2]), sin(values[i, 2])
+        if i != turned:  # ranges of one frame follow one another
+            turned, c, s = i, cos(values[i, 2]), sin(values[i, 2])
         arm_x, arm_y = c * row[4] - s * row[5], s * row[4] + c * row[5]
         dx, dy = values[i, 0] + arm_x - values[j, 0], values[i, 1] + arm_y - values[j, 1]
         distance = max(sqrt(dx * dx + dy * dy + row[6] * row[6]), _NOWHERE)
@@ -365,7 +388,7 @@ def linearise(
         i = order[dense[p]]
         for a in range(3):
             d = values[dense[p], a] - dense_at[p, a]
-            downhill = pull[3 * p + a]
+            downhill = dense_pull[3 * p + a]
             for q in range(len(dense)):
                 j = order[dense[q]]
                 for b in range(3):
@@ -379,8 +402,8 @@ def linearise(
                             below[slots_d[p, q], a, b] += w
                         elif q < p:
                             below[slots_d[p, q], b, a] += w
-            # At d the cost is d^T L d / 2 - pull^T d, and downhill is pull - L d.
-            cost -= 0.5 * d * (downhill + pull[3 * p + a])
+            # At d the cost is d^T L d / 2 - dense_pull^T d, and downhill is dense_pull - L d.
+            cost -= 0.5 * d * (downhill + dense_pull[3 * p + a])
             if with_system:
                 gradient[i, a] += free[dense[p], a] * downhill
 

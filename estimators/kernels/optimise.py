@@ -143,18 +143,17 @@ def marginalise(
     return undetermined, information, pull
 
 
-@compiled(f"{MATRIX}({INDICES}, {BLOCKS}, {BLOCKS}, int64)")
-def last_covariance(starts: IntArray, diagonal: FloatArray, below: FloatArray, blocks: int) -> FloatArray:
-    """Covariance (3 K, 3 K) of the last K variables in elimination order, from the factor.
-
-    They must be connected with one another.
-    """
-    count = len(starts) - 1
+@compiled(f"{MATRIX}({INDICES}, {INDICES}, {BLOCKS}, {BLOCKS}, int64)")
+def last_covariance(
+    starts: IntArray, rows: IntArray, diagonal: FloatArray, below: FloatArray, blocks: int
+) -> FloatArray:
+    """Covariance (3 K, 3 K) of the last K variables in elimination order, from the factor."""
+    first = len(starts) - 1 - blocks
     root = np.zeros((3 * blocks, 3 * blocks))
     for k in range(blocks):
-        j = count - blocks + k
-        root[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] = diagonal[j]
-        for m in range(k + 1, blocks):
-            root[3 * m : 3 * m + 3, 3 * k : 3 * k + 3] = below[starts[j] + m - k - 1]
+        root[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] = diagonal[first + k]
+        for p in range(starts[first + k], starts[first + k + 1]):
+            m = rows[p] - first
+            root[3 * m : 3 * m + 3, 3 * k : 3 * k + 3] = below[p]
     inverse = np.linalg.inv(root)
     return inverse.T @ inverse

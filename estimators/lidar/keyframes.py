@@ -107,7 +107,7 @@ class KeyframeTracker(ABC):
     def _update_increment(self, measured: PoseIncrement) -> Report:
         founds = measured.from_stamp_ns == measured.stamp_ns
         has_reference = measured.from_stamp_ns == self._reference_stamp_ns
-        is_possible = bool(np.isfinite(measured.increment).all()) and _is_covariance(measured.cov)
+        is_possible = bool(np.isfinite(measured.increment).all()) and is_covariance(measured.cov)
         if has_reference and is_possible and not founds:
             self._set_off()
         self._predict_to(measured.stamp_ns)
@@ -119,6 +119,6 @@ class KeyframeTracker(ABC):
         return self._follow(measured)
 
 
-def _is_covariance(cov: FloatArray) -> bool:
+def is_covariance(cov: FloatArray) -> bool:
     """Whether a matrix is finite and positive definite."""
     return bool(np.isfinite(cov).all() and np.linalg.eigvalsh(cov)[0] > 0.0)
