@@ -4,7 +4,7 @@ Each is held against the state predicted to its instant, corrected by those of t
 believed before it, as an extended Kalman filter does.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import isfinite
 
@@ -13,7 +13,6 @@ import numpy as np
 from estimators.base import Report, Verdict
 from estimators.geometry import wrap_angle
 from estimators.graph import factors
-from estimators.graph.losses import Loss
 from estimators.messages import FloatArray, LandmarkFrame, RangeFrame
 from estimators.models.landmark import range_and_bearing
 from estimators.models.range import horizontal_range
@@ -47,7 +46,7 @@ class Belief:
 
 
 def judge_ranges(
-    gate: RangeGate, frame: RangeFrame, belief: Belief, arm: FloatArray, numbers: Mapping[int, int], loss: Loss
+    gate: RangeGate, frame: RangeFrame, belief: Belief, arm: FloatArray, numbers: Mapping[int, int]
 ) -> tuple[Report, FloatArray]:
     """Verdicts on the ranges of a frame, and those that are believed as factors.
 
@@ -57,31 +56,50 @@ def judge_ranges(
         belief: state at the frame's instant; it is corrected.
         arm: (3,) tag antenna in the body frame [m].
         numbers: anchor id -> variable in the graph.
-        loss: of the factors.
 
     Returns:
-        The report; rows of `factors.ranges`, the pose still to be filled in. They are horizontal, as the
-        gate has them.
+        The report; rows of `factors.ranges`, -1 for the pose.
     """
     count = len(frame.ranges)
     verdicts = [Verdict.ACCEPTED] * count
     residuals, nis = np.full(count, np.nan), np.full(count, np.nan)
-    rows = np.empty((count, factors.RANGE))
     for i, item in enumerate(gate.horizontal(frame)):
         if isinstance(item, Verdict):
             verdicts[i] = item
             continue
         anchor, measured, sigma = item
-        anchor_id = int(frame.anchor_ids[i])
         predicted, by_pose = horizontal_range(belief.mean, anchor, arm)
         residual, H, R = np.array([measured - predicted]), by_pose[None], np.array([[sigma**2]])
         residuals[i], nis[i] = residual[0], belief.nis(residual, H, R)
-        verdicts[i] = gate.judge(anchor_id, frame.stamp_ns, float(nis[i]))
+        verdicts[i] = gate.judge(int(frame.anchor_ids[i]), frame.stamp_ns, float(nis[i]))
         if verdicts[i] is Verdict.ACCEPTED:
             belief.correct(residual, H, R)
-            rows[i] = (-1, numbers[anchor_id], measured, sigma, arm[0], arm[1], 0.0, loss.kind, loss.scale)
-    believed = np.array([verdict is Verdict.ACCEPTED for verdict in verdicts], dtype=np.bool_)
-    return Report(tuple(verdicts), residuals, nis), rows[believed]
+    report = Report(tuple(verdicts), residuals, nis)
+    return report, believed_ranges(gate, frame, report.verdicts, arm, numbers)
+
+
+def believed_ranges(
+    gate: RangeGate,
+    frame: RangeFrame,
+    verdicts: Sequence[Verdict],
+    arm: FloatArray,
+    numbers: Mapping[int, int],
+) -> FloatArray:
+    """Ranges with the verdict `ACCEPTED` as rows of `factors.ranges`, -1 for the pose.
+
+    They are horizontal, as the gate has them: those of the filters.
+    """
+    believed = [
+        (numbers[anchor_id], *item[1:])
+        for anchor_id, verdict, item in zip(
+            frame.anchor_ids.tolist(), verdicts, gate.horizontal(frame), strict=True
+        )
+        if verdict is Verdict.ACCEPTED and not isinstance(item, Verdict)
+    ]
+    if not believed:
+        return np.empty((0, factors.RANGE))
+    anchors, measured, sigmas = np.array(believed).T
+    return factors.ranges(-1, anchors, measured, sigmas, arm[:2])
 
 
 def judge_landmarks(

@@ -14,7 +14,6 @@ from estimators.geometry import lift, wrap_angle
 from estimators.graph import factors
 from estimators.graph.errors import GraphError
 from estimators.graph.jumps import is_jump
-from estimators.graph.losses import GAUSSIAN
 from estimators.lidar.keyframes import START_SPEED_SIGMA, KeyframeTracker, is_covariance
 from estimators.lidar.odometry import MAX_HEADING_SIGMA
 from estimators.messages import (
@@ -145,7 +144,7 @@ class GraphSmoother(KeyframeTracker):
         belief = self._judging.Belief(mean[STATE], cov[STATE, STATE])
         if isinstance(frame, RangeFrame):
             report, rows = self._judging.judge_ranges(
-                self._gate, frame, belief, self._setup.tag_in_body, self._anchor_numbers, GAUSSIAN
+                self._gate, frame, belief, self._setup.tag_in_body, self._anchor_numbers
             )
             table = "ranges"
         else:
@@ -153,10 +152,14 @@ class GraphSmoother(KeyframeTracker):
                 self._landmark_gate, frame, belief, self._setup.landmarks, self._landmark_numbers
             )
             report, table = Report((verdict,)), "sightings"
-        if len(rows) and not self._take(frame.stamp_ns, table, rows):
-            gated = (Verdict.GATED if v is Verdict.ACCEPTED else v for v in report.verdicts)
-            return Report(tuple(gated), report.residuals, report.nis)
-        return report
+        return self._taken(frame.stamp_ns, table, rows, report)
+
+    def _taken(self, stamp_ns: int, table: str, rows: FloatArray, report: Report) -> Report:
+        """Take factors; the report, unless the graph cannot be solved with them."""
+        if len(rows) == 0 or self._take(stamp_ns, table, rows):
+            return report
+        gated = (Verdict.GATED if v is Verdict.ACCEPTED else v for v in report.verdicts)
+        return Report(tuple(gated), report.residuals, report.nis)
 
     def _update_late(self, measurement: RangeFrame | LandmarkFrame | PoseIncrement) -> Report:
         """Take a measurement at an instant that was passed, if the window reaches back to it."""
@@ -271,7 +274,7 @@ class GraphSmoother(KeyframeTracker):
 
     def _guess(self, stamp_ns: int) -> FloatArray:  # noqa: ARG002
         """State (2, 3) that the search for a new node begins at."""
-        return self._mean[STATE].reshape(2, 3)
+        return self._mean[STATE].reshape(2, 3).copy()
 
     def _keep_keyframe(self, stamp_ns: int) -> None:
         node = self._node_of(stamp_ns)
