@@ -123,6 +123,7 @@ class GraphSmoother(KeyframeTracker):
         super()._predict_to(stamp_ns)
         if self._stands:
             self._window.stamps_ns[-1] = stamp_ns
+            self._keyframes = dict.fromkeys(self._keyframes, stamp_ns)
 
     def _follow(self, measured: PoseIncrement) -> Report:
         mean, cov = self._predicted(measured.stamp_ns)
