@@ -68,7 +68,7 @@ def arrays(graph: Graph) -> GraphArrays:
 def solve(
     graph: Graph,
     method: Method = "levenberg_marquardt",
-    iterations: int = 100,
+    iterations: int = 300,
     tolerance: float = 1e-7,
 ) -> Solution:
     """Find the most likely values of a graph's variables.
@@ -77,7 +77,7 @@ def solve(
         graph: its values are where the search begins; they stay as they are.
         method: Gauss-Newton is faster from a good start, Levenberg-Marquardt comes from farther away.
         iterations: at most.
-        tolerance: it ends when no value moves by more [m, rad].
+        tolerance: it ends when no value moves by more [m, rad], or nothing is gained any more.
 
     Raises:
         GraphError: numbers that are not finite, variables that nothing determines, or no optimum within so
