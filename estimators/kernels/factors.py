@@ -6,7 +6,7 @@ tuple of elimination order, pattern of the factor (`kernels.block_cholesky`) and
 places of its blocks off the diagonal.
 """
 
-from math import atan2, cos, log, sin, sqrt
+from math import atan2, cos, log1p, sin, sqrt
 from typing import TypeAlias
 
 import numpy as np
@@ -150,8 +150,8 @@ def loss(kind: float, scale: float, square: float, sign: float) -> tuple[float, 
         size = sqrt(square)
         return scale * (size - 0.5 * scale), scale / size
     if kind == 2.0 or (kind == 3.0 and sign > 0.0):
-        ratio = 1.0 + square / (scale * scale)
-        return 0.5 * scale * scale * log(ratio), 1.0 / ratio
+        ratio = square / (scale * scale)
+        return 0.5 * scale * scale * log1p(ratio), 1.0 / (1.0 + ratio)
     return 0.5 * square, 1.0
 
 
