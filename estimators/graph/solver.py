@@ -51,17 +51,18 @@ class Solution:
 def arrays(graph: Graph) -> GraphArrays:
     """A graph as the kernels take it."""
     dense = graph.dense
+    whole = np.ascontiguousarray
     return (
-        graph.free,
-        graph.increments,
-        graph.ranges,
-        graph.sightings,
-        graph.motions,
-        graph.priors,
+        whole(graph.free),
+        whole(graph.increments),
+        whole(graph.ranges),
+        whole(graph.sightings),
+        whole(graph.motions),
+        whole(graph.priors),
         dense.variables,
-        dense.at,
-        dense.information,
-        dense.gradient,
+        whole(dense.at),
+        whole(dense.information),
+        whole(dense.gradient),
     )
 
 
