@@ -85,22 +85,22 @@ def smooth(
 
 def _anchor_table(found: SmoothedLog, anchors: bool, biases: bool) -> Table:
     table = Table(title="anchors, and what is left of their ranges", title_justify="left")
-    table.add_column("anchor", justify="right")
-    headings = ["x\nm", "y\nm", "sigma\nm", "moved\nm"] if anchors else []
-    headings += ["bias\nm", "sigma\nm"] if biases else []
-    for heading in [*headings, "ranges", "blocked", "residual\nmean m", "residual\nRMS m"]:
-        table.add_column(heading, justify="right")
+    headings = ["anchor"]
+    headings += ["x\nm", "y\nm", "sigma\nm", "moved\nm"] if anchors else []
+    headings += ["bias\nm"] if biases else []
+    for heading in [*headings, "used", "out", "left: mean,\nRMS m"]:
+        table.add_column(heading, justify="right", no_wrap=True)
     for anchor_id, fix in found.smoothed.anchors.items():
-        cells = []
+        cells = [str(anchor_id)]
         if anchors:
             sigma = float(np.sqrt(np.linalg.eigvalsh(fix.position_cov)[-1]))
             x, y = fix.position.tolist()
             moved = float(np.linalg.norm(found.moved[anchor_id]))
             cells += [f"{x:.3f}", f"{y:.3f}", f"{sigma:.3f}", f"{moved:.3f}"]
         if biases:
-            cells += [f"{fix.bias:+.3f}", f"{fix.bias_sigma:.3f}"]
-        cells += [f"{fix.ranges}", f"{fix.blocked}", f"{fix.residual_mean:+.3f}", f"{fix.residual_rms:.3f}"]
-        table.add_row(str(anchor_id), *cells)
+            cells += [f"{fix.bias:+.3f} ± {fix.bias_sigma:.3f}"]
+        cells += [f"{fix.ranges}", f"{fix.blocked}", f"{fix.residual_mean:+.3f}, {fix.residual_rms:.3f}"]
+        table.add_row(*cells)
     return table
 
 

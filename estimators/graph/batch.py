@@ -15,7 +15,10 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from estimators.graph import factors
+from estimators.graph.errors import GraphError
 from estimators.graph.factors import Graph
+from estimators.graph.losses import GAUSSIAN
 from estimators.graph.recording import Recording
 from estimators.graph.solver import Solution, solve
 from estimators.messages import FloatArray, IntArray
@@ -94,19 +97,27 @@ def smooth(
 
     Source: huang2024 Eq. (29)-(38), over all poses.
     """
+    if find_anchors or find_biases:
+        # The prior would hold it, but that is no survey.
+        for i, anchor_id in enumerate(recording.anchor_ids):
+            if not (recording.ranges[:, 1] == i).any():
+                raise GraphError(f"anchor {anchor_id}: no range determines it")
     graph = recording.graph(guess(recording.stamps_ns), find_anchors, find_biases)
-    used = np.ones(len(recording.ranges), dtype=np.bool_)
-    iterations = 0
+    # What is left is taken at its face value: a one-sided loss would draw biases down.
+    plain = recording.ranges.copy()
+    plain[:, factors.RANGE_LOSS] = GAUSSIAN.kind
+    solution, used, iterations = None, np.zeros(len(plain), dtype=np.bool_), 0
     for number in range(_ROUNDS):
         on_round(number)
         solution = solve(graph)
         iterations += solution.iterations
-        residuals = range_residuals(solution.values, recording.ranges)
-        blocked = _blocked(residuals / recording.ranges[:, 3], recording)
-        if (blocked == ~used).all():
+        blocked = _blocked(range_residuals(solution.values, plain) / plain[:, 3], recording)
+        if number > 0 and (used == ~blocked).all():
             break
-        used = ~blocked
-        graph = replace(graph, values=solution.values, ranges=recording.ranges[used])
+        if number < _ROUNDS - 1:
+            used = ~blocked
+            graph = replace(graph, values=solution.values, ranges=plain[used])
+    assert solution is not None
     return _told(recording, graph, solution, used, iterations)
 
 

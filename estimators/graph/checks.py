@@ -1,12 +1,17 @@
 """Whether a graph can have a solution, before it is solved."""
 
+from typing import TypeAlias
+
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from estimators.graph.errors import GraphError
 from estimators.graph.factors import Graph
 from estimators.messages import FloatArray, IntArray
+
+BoolArray: TypeAlias = NDArray[np.bool_]
 
 _VARIABLES = {"increments": 2, "ranges": 2, "sightings": 2, "motions": 4, "priors": 1}
 """Leading columns of each table that are variables."""
@@ -21,7 +26,7 @@ def check(graph: Graph) -> None:
             variables which are themselves free to move together, determine.
     """
     _check_numbers(graph)
-    free = graph.free.any(axis=1)
+    free: BoolArray = np.asarray(graph.free.any(axis=1), dtype=np.bool_)
     equations = np.zeros(len(free), dtype=np.int64)
     for table, columns in _VARIABLES.items():
         np.add.at(equations, _variables(getattr(graph, table), columns), _EQUATIONS[table])
@@ -31,7 +36,7 @@ def check(graph: Graph) -> None:
     if len(short):
         i = int(short[0])
         raise GraphError(
-            f"{graph.name(i)}: measured numbers that bear on it: {equations[i]}, at least {unknowns[i]:.0f} "
+            f"{graph.name(i)}: {equations[i] or 'no'} measured numbers bear on it, at least {unknowns[i]:.0f} "
             "are needed"
         )
     _check_anchoring(graph, free)
@@ -67,7 +72,7 @@ def _check_numbers(graph: Graph) -> None:
             raise GraphError(f"{name}: a variable that the graph does not have, there are {count}")
 
 
-def _check_anchoring(graph: Graph, free: FloatArray) -> None:
+def _check_anchoring(graph: Graph, free: BoolArray) -> None:
     """Every connected part needs something that is known: a fixed anchor or landmark, or a prior."""
     count = len(free)
     edges = [

@@ -11,6 +11,8 @@ A variable is three numbers:
 
 Variables have numbers. Anchors and landmarks come first, poses and velocities after them as time goes on:
 a graph is solved fastest in this order. Residuals are measured minus predicted.
+
+Where neither increments nor sightings are, yaw may be held fixed in all poses and velocities alike.
 """
 
 from collections.abc import Callable
@@ -27,6 +29,8 @@ FIXED, ALL, PLACE, BIAS = (0, 0, 0), (1, 1, 1), (1, 1, 0), (0, 0, 1)
 
 INCREMENT, RANGE, SIGHTING, MOTION, PRIOR = 17, 9, 8, 7, 14
 """Columns of each table."""
+RANGE_LOSS = 7
+"""Column of a range's loss."""
 
 
 def increments(

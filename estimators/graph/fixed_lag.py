@@ -72,7 +72,8 @@ class FixedLag:
         """
         self.insert(stamp_ns, state)
         variables = self.variable(0) + np.arange(self._width)
-        self.graph.dense = DensePrior(variables, state, np.linalg.inv(cov), np.zeros(3 * self._width))
+        information = np.asarray(np.linalg.inv(cov), dtype=np.float64)
+        self.graph.dense = DensePrior(variables, state, information, np.zeros(3 * self._width))
 
     @property
     def newest(self) -> FloatArray:
@@ -137,9 +138,7 @@ class FixedLag:
         """
         if len(self.stamps_ns) < 2 or self.stamps_ns[0] >= horizon_ns:
             return
-        leaving = window.leaving(
-            self.stamps_ns, horizon_ns, self.graph.increments, self._known, self._width
-        )
+        leaving = window.leaving(self.stamps_ns, horizon_ns, self.graph.increments, self._known, self._width)
         leaving[-1] = False
         for stamp_ns in kept_ns:
             if (node := self.node_at(stamp_ns)) is not None:
@@ -208,21 +207,21 @@ class FixedLag:
         numbers = np.cumsum(~gone) - 1
         touched = gone.copy()
         touched[graph.dense.variables] = True
-        taken: dict[str, FloatArray] = {}
+        part = Graph(graph.values, graph.free, dense=graph.dense)
         for name, columns in _TABLES.items():
             table = getattr(graph, name)
             if len(table):
                 goes = np.ones(count, dtype=np.bool_) if everything else gone
-                taken[name], rest = window.divide(table, columns, goes, touched, numbers)
+                taken, rest = window.divide(table, columns, goes, touched, numbers)
+                setattr(part, name, taken)
                 setattr(graph, name, rest)
         touched[: self._known] = False
         staying, eliminated = np.flatnonzero(touched & ~gone), int(gone.sum())
         order = np.full(count, -1, dtype=np.int64)
         order[gone] = np.arange(eliminated)
         order[staying] = eliminated + np.arange(len(staying))
-        part = arrays(Graph(graph.values, graph.free, **taken, dense=graph.dense))
-        system = system_of(part, order, eliminated + len(staying))
-        _, information, gradient = optimise.marginalise(graph.values, part, system, eliminated)
+        system = system_of(arrays(part), order, eliminated + len(staying))
+        _, information, gradient = optimise.marginalise(graph.values, arrays(part), system, eliminated)
         graph.dense = DensePrior(numbers[staying], graph.values[staying], information, gradient)
         graph.values, graph.free = graph.values[~gone], graph.free[~gone]
         self.stamps_ns = self.stamps_ns[~leaving]

@@ -82,7 +82,8 @@ class Recording:
         steps = [m for m in measurements if isinstance(m, PoseIncrement) and _is_step(m)]
         frames = [m for m in measurements if isinstance(m, RangeFrame)]
         looks = [m for m in measurements if isinstance(m, LandmarkFrame)]
-        instants = [m.stamp_ns for m in (*steps, *frames, *looks)] + [m.from_stamp_ns for m in steps]
+        instants = [stamp_ns for m in steps for stamp_ns in (m.from_stamp_ns, m.stamp_ns)]
+        instants += [m.stamp_ns for m in frames] + [m.stamp_ns for m in looks]
         self.stamps_ns = _apart(np.unique(np.array(instants, dtype=np.int64)))
         if len(self.stamps_ns) < 2:
             raise GraphError(
@@ -167,7 +168,7 @@ class Recording:
             heights,
             _RANGE_LOSS,
         )
-        return rows[np.isfinite(measured) & (measured > np.abs(heights))]
+        return np.asarray(rows[np.isfinite(measured) & (measured > np.abs(heights))])
 
     def _sighting_rows(self, look: LandmarkFrame) -> FloatArray:
         known = [i for i, landmark in enumerate(look.landmark_ids.tolist()) if landmark in self._landmarks]
@@ -179,7 +180,8 @@ class Recording:
             look.range_sigma,
             look.bearing_sigma,
         )
-        return rows[np.isfinite(rows).all(axis=1) & (rows[:, [2, 4, 5]] > 0.0).all(axis=1)]
+        whole = np.isfinite(rows).all(axis=1) & (rows[:, [2, 4, 5]] > 0.0).all(axis=1)
+        return np.asarray(rows[whole])
 
     def _increment_rows(self, steps: Sequence[PoseIncrement]) -> FloatArray:
         if not steps:
@@ -211,6 +213,7 @@ def _anchor_prior(at: FloatArray) -> DensePrior:
     """What is known of anchors (A, 3) beforehand: their places, and how their biases hang together."""
     count = len(at)
     biases = COMMON_BIAS_SIGMA**2 * np.ones((count, count)) + OWN_BIAS_SIGMA**2 * np.eye(count)
-    information = np.kron(np.eye(count), np.diag([PLACE_SIGMA**-2, PLACE_SIGMA**-2, 0.0]))
+    by_place = PLACE_SIGMA**-2
+    information = np.diag(np.tile([by_place, by_place, 0.0], count))
     information[2::3, 2::3] = np.linalg.inv(biases)
     return DensePrior(np.arange(count), at, information, np.zeros(3 * count))

@@ -64,6 +64,7 @@ class GraphSmoother(KeyframeTracker):
         self._landmark_numbers = {i: len(setup.anchors) + k for k, i in enumerate(setup.landmarks)}
         places = [*(p[:2] for p in setup.anchors.values()), *setup.landmarks.values()]
         self._known = np.array([[*place, 0.0] for place in places]).reshape(-1, 3)
+        self._keyframes: dict[int, int] = {}
         self.reset()
 
     def reset(self) -> None:
@@ -166,8 +167,8 @@ class GraphSmoother(KeyframeTracker):
         """Take a measurement at an instant that was passed, if the window reaches back to it."""
         node = None if self._stands else self._node_of(measurement.stamp_ns)
         if node is None:
-            is_frame = isinstance(measurement, RangeFrame)
-            return Report((Verdict.LATE,) * (len(measurement.ranges) if is_frame else 1))
+            count = len(measurement.ranges) if isinstance(measurement, RangeFrame) else 1
+            return Report((Verdict.LATE,) * count)
         try:
             if isinstance(measurement, PoseIncrement):
                 return Report((self._update_late_increment(measurement, node),))
@@ -247,7 +248,7 @@ class GraphSmoother(KeyframeTracker):
         self._window.begin(
             stamp_ns, self._mean[STATE].reshape(2, 3), self._cov[STATE, STATE] * np.outer(scale, scale)
         )
-        self._keyframes: dict[int, int] = {}
+        self._keyframes = {}
         self._reference_stamp_ns = None
 
     def _predicted(self, stamp_ns: int) -> tuple[FloatArray, FloatArray]:

@@ -82,7 +82,7 @@ def pattern(count: int, pairs: IntArray) -> tuple[IntArray, IntArray]:
 @compiled(f"int64({INDICES}, {INDICES}, int64, int64)")
 def place_of(starts: IntArray, rows: IntArray, column: int, row: int) -> int:
     """Place in `rows` of a block that the factor has."""
-    low, high = starts[column], starts[column + 1] - 1
+    low, high = int(starts[column]), int(starts[column + 1]) - 1
     while low < high:
         middle = (low + high) // 2
         if rows[middle] < row:
@@ -168,7 +168,9 @@ def solve_down(
         x[j, 2] = (x[j, 2] - L[2, 0] * x[j, 0] - L[2, 1] * x[j, 1]) / L[2, 2]
         for p in range(starts[j], starts[j + 1]):
             for i in range(3):
-                x[rows[p], i] -= below[p, i, 0] * x[j, 0] + below[p, i, 1] * x[j, 1] + below[p, i, 2] * x[j, 2]
+                x[rows[p], i] -= (
+                    below[p, i, 0] * x[j, 0] + below[p, i, 1] * x[j, 1] + below[p, i, 2] * x[j, 2]
+                )
 
 
 @compiled(f"void({INDICES}, {INDICES}, {BLOCKS}, {BLOCKS}, {MATRIX})")

@@ -155,7 +155,9 @@ def loss(kind: float, scale: float, square: float, sign: float) -> tuple[float, 
     return 0.5 * square, 1.0
 
 
-@compiled(f"void({MATRIX}, {BLOCKS}, {BLOCKS}, {INDICES}, int64, int64, int64, {MATRIX}, {MATRIX}, {MATRIX}, {VECTOR}, int64)")
+@compiled(
+    f"void({MATRIX}, {BLOCKS}, {BLOCKS}, {INDICES}, int64, int64, int64, {MATRIX}, {MATRIX}, {MATRIX}, {VECTOR}, int64)"
+)
 def _add(
     gradient: FloatArray,
     diagonal: FloatArray,
@@ -219,7 +221,9 @@ def linearise(
 
     Source: huang2024 Eq. (29)-(38); weights of robust losses: iteratively reweighted least squares.
     """
-    free, increments, ranges, sightings, motions, priors, dense, dense_at, dense_information, dense_pull = graph
+    free, increments, ranges, sightings, motions, priors, dense, dense_at, dense_information, dense_pull = (
+        graph
+    )
     order, _, _, (slots_i, slots_r, slots_s, slots_m, slots_d) = system
     if with_system:
         gradient[:] = 0.0
@@ -289,7 +293,7 @@ def linearise(
         cost += rho
         if with_system:
             ux, uy = dx / distance, dy / distance
-            u_yaw = uy * arm_x - ux * arm_y
+            u_yaw = (uy * arm_x - ux * arm_y) * free[i, 2]
             w = weight * information
             p, q = order[i], order[j]
             if p >= 0:
@@ -355,7 +359,7 @@ def linearise(
                 w * (mixed * place + of_speed * speed),
             )
             cost += 0.5 * (place * pull_place + speed * pull_speed)
-            if with_system:
+            if with_system and free[int(row[0]), axis] != 0.0:
                 n = 0
                 for a in range(4):
                     i = order[int(row[a])]

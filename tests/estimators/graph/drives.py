@@ -42,7 +42,9 @@ def drive(count: int, seed: int, noise: float = 1.0, dt: float = 0.1) -> Drive:
     """A drive round the room; the noise comes from the seed, and is multiplied by `noise`; `dt` [s]."""
     rng = np.random.default_rng(seed)
     times = dt * np.arange(count)
-    truth = np.column_stack([5 + 4 * np.cos(0.1 * times), 5 + 4 * np.sin(0.1 * times), 0.1 * times + np.pi / 2])
+    truth = np.column_stack(
+        [5 + 4 * np.cos(0.1 * times), 5 + 4 * np.sin(0.1 * times), 0.1 * times + np.pi / 2]
+    )
     steps = np.array([between(a, b) for a, b in zip(truth[:-1], truth[1:], strict=True)]).reshape(-1, 3)
     steps += noise * STEP_SIGMA * rng.standard_normal(steps.shape)
     ranges = np.linalg.norm(truth[:, None, :2] - ANCHORS, axis=2)

@@ -4,7 +4,7 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import L, X
 
-from estimators.messages import FloatArray
+from estimators.messages import FloatArray, IntArray
 from tests.estimators.graph.drives import ANCHORS, RANGE_SIGMA, SIGHTING_SIGMA, STEP_SIGMA, Drive
 
 
@@ -18,7 +18,7 @@ def gtsam_graph(
         values.insert(L(i), anchor)
         graph.add(gtsam.PriorFactorPoint2(L(i), anchor, tight))
     of_step = gtsam.noiseModel.Diagonal.Sigmas(STEP_SIGMA)
-    of_range = gtsam.noiseModel.Isotropic.Sigma(1, RANGE_SIGMA)
+    of_range: gtsam.noiseModel.Base = gtsam.noiseModel.Isotropic.Sigma(1, RANGE_SIGMA)
     if robust is not None:
         of_range = gtsam.noiseModel.Robust.Create(robust, of_range)
     for k, guess in enumerate(drive.guess):
@@ -30,7 +30,7 @@ def gtsam_graph(
     return graph, values
 
 
-def add_closures(graph: gtsam.NonlinearFactorGraph, first: FloatArray, second: FloatArray, z: FloatArray) -> None:
+def add_closures(graph: gtsam.NonlinearFactorGraph, first: IntArray, second: IntArray, z: FloatArray) -> None:
     """Loop closures with the noise of a step."""
     noise = gtsam.noiseModel.Diagonal.Sigmas(STEP_SIGMA)
     for a, b, measured in zip(first, second, z, strict=True):
@@ -41,8 +41,8 @@ def add_landmarks(
     graph: gtsam.NonlinearFactorGraph,
     values: gtsam.Values,
     guess: FloatArray,
-    who: FloatArray,
-    which: FloatArray,
+    who: IntArray,
+    which: IntArray,
     measured: FloatArray,
 ) -> None:
     """Landmarks, numbered behind the anchors, and what was seen of them."""

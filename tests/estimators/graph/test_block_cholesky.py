@@ -61,7 +61,9 @@ def test_blocks_of_the_inverse_are_those_of_the_dense_inverse(
     factor = blocks_of(A, starts, rows)
     block_cholesky.factorise(starts, rows, *factor, count)
     found = block_cholesky.inverse_blocks(starts, rows, *factor)
-    for actual, expected in zip(found, blocks_of(np.linalg.inv(A), starts, rows), strict=True):
+    for actual, expected in zip(
+        found, blocks_of(np.asarray(np.linalg.inv(A), dtype=np.float64), starts, rows), strict=True
+    ):
         np.testing.assert_allclose(actual, expected, atol=1e-8)
 
 

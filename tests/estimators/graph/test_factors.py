@@ -1,6 +1,7 @@
 """What factors add to the normal equations, against the models of the filters and finite differences."""
 
 from collections.abc import Callable
+from typing import TypeAlias
 
 import numpy as np
 import pytest
@@ -22,7 +23,7 @@ from tests.estimators.models.finite_differences import numerical_jacobian
 COV = np.array([[4e-3, 1e-3, 2e-4], [1e-3, 3e-3, -3e-4], [2e-4, -3e-4, 1e-3]])
 ARM = np.array([0.2, -0.1])
 LOSSES = [Loss(kind, 1.5) for kind in LossKind]
-INFORMATION = np.linalg.inv(COV)
+INFORMATION: FloatArray = np.asarray(np.linalg.inv(COV))
 
 
 def dense_system(graph: Graph, values: FloatArray) -> tuple[float, FloatArray, FloatArray]:
@@ -45,7 +46,12 @@ def dense_system(graph: Graph, values: FloatArray) -> tuple[float, FloatArray, F
 def graphs(loss: Loss) -> dict[str, Graph]:
     """A graph with one factor of each kind; variable 0 is an anchor or landmark, the others poses and speeds."""
     values, free = np.zeros((5, 3)), np.ones((5, 3))
-    dense = DensePrior(np.array([1, 3]), np.ones((2, 3)), np.kron([[2.0, 1], [1, 3]], np.eye(3)), np.arange(6.0))
+    dense = DensePrior(
+        np.array([1, 3]),
+        np.ones((2, 3)),
+        np.kron(np.array([[2.0, 1.0], [1.0, 3.0]]), np.eye(3)),
+        np.arange(6.0),
+    )
     return {
         "increment": Graph(values, free, increments=factors.increments(1, 3, [0.4, 0.1, 0.3], COV, loss)),
         "range": Graph(values, free, ranges=factors.ranges(1, 0, 3.0, 0.3, ARM, 1.2, loss)),
@@ -57,8 +63,7 @@ def graphs(loss: Loss) -> dict[str, Graph]:
     }
 
 
-MODELS: dict[str, tuple[Callable[[FloatArray], tuple[FloatArray, FloatArray]], FloatArray]] = {}
-"""Name of the kind -> residual (M,) and predicted's Jacobian (M, 15) by all variables; information (M, M)."""
+Model: TypeAlias = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
 
 
 def _blocks(size: int, **columns: FloatArray) -> FloatArray:
@@ -97,14 +102,19 @@ def _motion(v: FloatArray) -> tuple[FloatArray, FloatArray]:
     return -predicted, J
 
 
-MODELS["increment"] = _increment, INFORMATION
-MODELS["range"] = _range, np.eye(1) / 0.3**2
-MODELS["sighting"] = _sighting, np.diag([0.2**-2, 0.1**-2])
-MODELS["motion"] = _motion, np.linalg.inv(constant_velocity(0.2, 0.5, 1.5)[1])
+MODELS: dict[str, tuple[Model, FloatArray]] = {
+    "increment": (_increment, INFORMATION),
+    "range": (_range, np.eye(1) / 0.3**2),
+    "sighting": (_sighting, np.diag([0.2**-2, 0.1**-2])),
+    "motion": (_motion, np.asarray(np.linalg.inv(constant_velocity(0.2, 0.5, 1.5)[1]))),
+}
+"""Name of the kind -> residual (M,) and predicted's Jacobian (M, 15) by all variables; information (M, M)."""
 
 numbers = st.floats(-3.0, 3.0)
-every_values = st.lists(numbers, min_size=15, max_size=15).map(lambda row: np.array(row).reshape(5, 3)).filter(
-    lambda v: bool(np.hypot(*(v[0] - v[1])[:2]) > 0.5)
+every_values = (
+    st.lists(numbers, min_size=15, max_size=15)
+    .map(lambda row: np.array(row).reshape(5, 3))
+    .filter(lambda v: bool(np.hypot(*(v[0] - v[1])[:2]) > 0.5))
 )
 
 

@@ -9,7 +9,15 @@ from estimators.graph.errors import GraphError
 from estimators.graph.fixed_lag import FixedLag
 from estimators.graph.solver import solve
 from estimators.messages import FloatArray
-from tests.estimators.graph.drives import ANCHORS, RANGE_SIGMA, STEP_SIGMA, Drive, drive, graph_of, pose_errors
+from tests.estimators.graph.drives import (
+    ANCHORS,
+    RANGE_SIGMA,
+    STEP_SIGMA,
+    Drive,
+    drive,
+    graph_of,
+    pose_errors,
+)
 
 STEP_NS = 100_000_000
 KNOWN = np.column_stack([ANCHORS, np.zeros(len(ANCHORS))])
@@ -87,7 +95,9 @@ def test_a_node_where_increments_begin_stays_until_they_have_left() -> None:
     window.begin(0, np.array([[5.0, 5.0, 0.0]]), START)
     for k in range(1, 11):  # all from the same keyframe
         window.insert(k * STEP_NS, np.array([[5.0 + 0.1 * k, 5.0, 0.0]]))
-        step = factors.increments(window.variable(0), window.variable(len(window.stamps_ns) - 1), [0.1 * k, 0, 0], COV)
+        step = factors.increments(
+            window.variable(0), window.variable(len(window.stamps_ns) - 1), [0.1 * k, 0, 0], COV
+        )
         window.add(increments=step)
         window.update()
         window.drop_before((k - 3) * STEP_NS)
@@ -101,7 +111,9 @@ def test_a_node_where_increments_begin_stays_until_they_have_left() -> None:
 def moving(stamps: list[int], late: int | None = None) -> FixedLag:
     """Window of a body that moves at 1 m/s, ranges at each instant; one node put in afterwards."""
     window = FixedLag(KNOWN, 2)
-    window.begin(0, np.array([[2.0, 5.0, 0.0], [1.0, 0.0, 0.0]]), np.diag([0.1, 0.1, 0.1, 0.3, 0.3, 0.3]) ** 2)
+    window.begin(
+        0, np.array([[2.0, 5.0, 0.0], [1.0, 0.0, 0.0]]), np.diag([0.1, 0.1, 0.1, 0.3, 0.3, 0.3]) ** 2
+    )
     for stamp in stamps:
         x = 2.0 + stamp * 0.1
         node = window.insert(stamp * STEP_NS, np.array([[x, 5.0, 0.0], [1.0, 0.0, 0.0]]))
@@ -134,7 +146,9 @@ def test_what_comes_late_counts_as_if_it_had_been_in_time(late: int) -> None:
     np.testing.assert_allclose(covs[1], covs[0], rtol=1e-3, atol=1e-7)
     for node in (2, 9):
         state, cov = afterwards.state_of(node)
-        np.testing.assert_allclose(state, in_time.graph.values[4 + 2 * node : 6 + 2 * node].ravel(), atol=1e-4)
+        np.testing.assert_allclose(
+            state, in_time.graph.values[4 + 2 * node : 6 + 2 * node].ravel(), atol=1e-4
+        )
         np.testing.assert_allclose(cov, in_time.state_of(node)[1], rtol=1e-3, atol=1e-7)
 
 

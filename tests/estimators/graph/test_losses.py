@@ -14,7 +14,9 @@ scales = st.floats(0.3, 5.0)
 
 @EVERY_LOSS
 @given(st.floats(-20.0, 20.0), scales)
-def test_the_weight_is_the_derivative_over_the_residual(kind: LossKind, residual: float, scale: float) -> None:
+def test_the_weight_is_the_derivative_over_the_residual(
+    kind: LossKind, residual: float, scale: float
+) -> None:
     loss, step = Loss(kind, scale), 1e-5
     ahead, behind = loss.value(np.array([residual + step, residual - step]))
     weight = loss.weight(np.array([residual]))[0]

@@ -1,5 +1,6 @@
 """The estimators on a graph: as sure as they may be, late measurements taken, jumps told."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +12,7 @@ from estimators.ekf import Ekf
 from estimators.graph.jumps import is_jump
 from estimators.graph.pf_ibas_graph import PfIbasGraph
 from estimators.graph.smoother import GraphSmoother
-from estimators.messages import FloatArray, LandmarkFrame, PoseIncrement, RangeFrame
+from estimators.messages import FloatArray, LandmarkFrame, Measurement, PoseIncrement, RangeFrame
 from tests.estimators.matched_world import (
     ACCEL_NOISE,
     HALL,
@@ -27,7 +28,7 @@ from tests.estimators.matched_world import (
 from tests.strategies import range_frame
 
 Taken = RangeFrame | PoseIncrement
-NOISE = {
+NOISE: dict[str, float] = {
     "range_sigma": RANGE_SIGMA,
     "range_gate": 1 - 1e-9,
     "suspect_for": 0.0,
@@ -35,20 +36,29 @@ NOISE = {
     "accel_noise": ACCEL_NOISE,
     "yaw_accel_noise": YAW_ACCEL_NOISE,
 }
-KINDS = {
-    "graph": lambda lag: GraphSmoother(GraphSmoother.Config(**NOISE, lag=lag), HALL),
-    "pf_ibas_graph": lambda lag: PfIbasGraph(PfIbasGraph.Config(**NOISE, lag=lag), HALL),
-}
+KINDS: dict[str, type[GraphSmoother]] = {"graph": GraphSmoother, "pf_ibas_graph": PfIbasGraph}
 EVERY_KIND = pytest.mark.parametrize("kind", KINDS)
 TIGHT = np.diag([1e-6, 1e-6, 1e-7])
 NOW_NS = 10**9
 
 
-def taken(steps: list[tuple[int, list[Taken]]]) -> list[Taken]:
+def matched(kind: str, lag: float) -> GraphSmoother:
+    """Estimator with the world's own noise."""
+    cls = KINDS[kind]
+    return cls(cls.Config(**NOISE, lag=lag), HALL)
+
+
+def plain(kind: str) -> GraphSmoother:
+    """Estimator with its defaults."""
+    cls = KINDS[kind]
+    return cls(cls.Config(), HALL)
+
+
+def taken(steps: Sequence[tuple[int, list[Taken]]]) -> list[Taken]:
     return [measurement for _, measurements in steps for measurement in measurements]
 
 
-def run(estimator: Estimator, measurements: list[Taken]) -> list[Report]:
+def run(estimator: Estimator, measurements: Sequence[Measurement]) -> list[Report]:
     return [estimator.update(measurement) for measurement in measurements]
 
 
@@ -58,7 +68,7 @@ def nees_at_the_end(kind: str, seeds: int) -> FloatArray:
     for seed in range(seeds):
         rng = np.random.default_rng(seed)
         truth = random_truth(rng, 3.0)
-        estimator = KINDS[kind](1.0)
+        estimator = matched(kind, 1.0)
         run(estimator, taken(measured_walk(truth, rng)))
         mean, cov = estimator.state
         error = pose_error(mean, truth[-1])
@@ -69,14 +79,14 @@ def nees_at_the_end(kind: str, seeds: int) -> FloatArray:
 @EVERY_KIND
 def test_nees_is_within_both_bounds(kind: str) -> None:
     nees = nees_at_the_end(kind, 25)
-    low, high = chi2.ppf([0.005, 0.995], 3 * len(nees))
+    low, high = chi2.ppf(0.005, 3 * len(nees)), chi2.ppf(0.995, 3 * len(nees))
     assert low < nees.sum() < high, f"mean NEES {nees.mean():.2f}, expected 3"
 
 
 @EVERY_KIND
 def test_noiseless_measurements_of_a_motion_that_fits_give_no_error(kind: str) -> None:
     truth = constant_velocity_truth(np.array([0.5, 0.2, 0.4]), 4.0)
-    estimator = KINDS[kind](2.0)
+    estimator = matched(kind, 2.0)
     run(estimator, taken(measured_walk(truth, np.random.default_rng(0), noise=0.0)))
     np.testing.assert_allclose(pose_error(estimator.state[0], truth[-1]), 0.0, atol=1e-3)
 
@@ -85,7 +95,7 @@ def test_where_all_is_nearly_linear_it_agrees_with_the_kalman_filter() -> None:
     rng = np.random.default_rng(3)
     truth = random_truth(rng, 2.0)
     measurements = taken(measured_walk(truth, rng))
-    ekf, graph = Ekf(Ekf.Config(**NOISE), HALL), KINDS["graph"](5.0)
+    ekf, graph = Ekf(Ekf.Config(**NOISE), HALL), matched("graph", 5.0)
     for a, b in zip(run(ekf, measurements), run(graph, measurements), strict=True):
         assert a.verdicts == b.verdicts
     sigma = np.sqrt(np.diag(ekf.state[1]))
@@ -96,7 +106,7 @@ def test_where_all_is_nearly_linear_it_agrees_with_the_kalman_filter() -> None:
 @EVERY_KIND
 def test_the_window_is_bounded(kind: str) -> None:
     truth = constant_velocity_truth(np.array([0.3, 0.0, 0.0]), 6.0)
-    estimator = KINDS[kind](0.5)
+    estimator = matched(kind, 0.5)
     steps = taken(measured_walk(truth, np.random.default_rng(1)))
     run(estimator, steps)
     # Half a second has 13 to 16 nodes; the keyframe before it and its successors may stay 0.4 s longer.
@@ -106,7 +116,7 @@ def test_the_window_is_bounded(kind: str) -> None:
 def test_late_measurements_within_the_window_end_where_those_in_time_do() -> None:
     truth = constant_velocity_truth(np.array([0.4, 0.1, 0.2]), 3.0)
     steps = taken(measured_walk(truth, np.random.default_rng(2)))
-    in_time, late = KINDS["graph"](2.0), KINDS["graph"](2.0)
+    in_time, late = matched("graph", 2.0), matched("graph", 2.0)
     run(in_time, steps)
     delayed = [m for m in steps if 2.45 < m.stamp_ns * 1e-9 < 2.7]  # between two keyframes
     assert {type(m) for m in delayed} == {RangeFrame, PoseIncrement}
@@ -121,7 +131,7 @@ def test_late_measurements_within_the_window_end_where_those_in_time_do() -> Non
 
 def test_late_outliers_are_gated_and_strays_refused() -> None:
     truth = constant_velocity_truth(np.array([0.4, 0.1, 0.2]), 2.0)
-    smoother = KINDS["graph"](1.0)
+    smoother = matched("graph", 1.0)
     smoother._gate._limit = 9.0
     run(smoother, taken(measured_walk(truth, np.random.default_rng(2))))
     stamp_ns = 75 * STEP_NS
@@ -179,7 +189,7 @@ def test_landmarks_sharpen_the_pose() -> None:
 def test_after_an_hour_without_anything_it_finds_itself_again() -> None:
     smoother = GraphSmoother(GraphSmoother.Config(), HALL)
     run(smoother, [true_ranges(k * 10**8, HALL.start.pose, HALL) for k in range(10)])
-    there = HALL.start.pose + [2.0, -1.0, 0.0]
+    there = HALL.start.pose + np.array([2.0, -1.0, 0.0])
     hour = 3600 * 10**9
     run(smoother, [true_ranges(hour + k * 10**8, there, HALL) for k in range(30)])
     pose = smoother.pose_at(hour + 3 * 10**9)
@@ -190,8 +200,7 @@ def test_after_an_hour_without_anything_it_finds_itself_again() -> None:
 
 @EVERY_KIND
 def test_ranges_that_the_filter_refuses_do_not_move_the_graph(kind: str) -> None:
-    cls = GraphSmoother if kind == "graph" else PfIbasGraph
-    disturbed, undisturbed = cls(cls.Config(), HALL), cls(cls.Config(), HALL)
+    disturbed, undisturbed = plain(kind), plain(kind)
     for estimator in (disturbed, undisturbed):
         run(estimator, [true_ranges(k * 10**8, HALL.start.pose, HALL) for k in range(11)])
     frame = true_ranges(NOW_NS + 1, HALL.start.pose, HALL)
@@ -203,17 +212,17 @@ def test_ranges_that_the_filter_refuses_do_not_move_the_graph(kind: str) -> None
 def test_a_correction_that_the_covariance_explains_is_no_jump() -> None:
     cov = np.diag([0.1, 0.1, 0.05]) ** 2
     before = np.array([1.0, 2.0, np.pi - 0.01])
-    assert not is_jump(before, cov, before + [0.3, 0.0, 0.0])
-    assert not is_jump(before, 1e-6 * cov, before + [0.04, 0.0, 0.0])  # too small to matter
-    assert is_jump(before, cov, before + [0.6, 0.0, 0.0])
-    assert is_jump(before, cov, before + [0.0, 0.0, 0.4])
+    assert not is_jump(before, cov, before + np.array([0.3, 0.0, 0.0]))
+    assert not is_jump(before, 1e-6 * cov, before + np.array([0.04, 0.0, 0.0]))  # too small to matter
+    assert is_jump(before, cov, before + np.array([0.6, 0.0, 0.0]))
+    assert is_jump(before, cov, before + np.array([0.0, 0.0, 0.4]))
     assert not is_jump(before, cov, np.array([1.0, 2.0, -np.pi + 0.01]))  # the same heading, nearly
 
 
 def test_a_jump_is_told_once() -> None:
     """The start mark was missed by eight sigma, and the gate lets it be mended."""
     smoother = GraphSmoother(GraphSmoother.Config(range_gate=1 - 1e-12), HALL)
-    there = HALL.start.pose + [1.2, 0.0, 0.0]
+    there = HALL.start.pose + np.array([1.2, 0.0, 0.0])
     counters = []
     for k in range(5):
         smoother.update(true_ranges(k * 10**8, there, HALL))

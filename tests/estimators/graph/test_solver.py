@@ -44,7 +44,9 @@ def assert_same_poses(found: FloatArray, reference: FloatArray) -> None:
 @pytest.mark.parametrize("count", [100, 1000])
 def test_a_chain_has_the_optimum_of_gtsam(method: Method, count: int) -> None:
     chain = drive(count, seed=1)
-    assert_same_poses(solve(graph_of(chain), method).values[FIRST:], poses_of(optimum(*gtsam_graph(chain)), count))
+    assert_same_poses(
+        solve(graph_of(chain), method).values[FIRST:], poses_of(optimum(*gtsam_graph(chain)), count)
+    )
 
 
 @pytest.mark.parametrize(
@@ -55,7 +57,9 @@ def test_a_chain_has_the_optimum_of_gtsam(method: Method, count: int) -> None:
     ],
     ids=["huber", "cauchy"],
 )
-def test_robust_losses_have_the_optimum_of_gtsam(loss: Loss, theirs: gtsam.noiseModel.mEstimator.Base) -> None:
+def test_robust_losses_have_the_optimum_of_gtsam(
+    loss: Loss, theirs: gtsam.noiseModel.mEstimator.Base
+) -> None:
     chain = drive(300, seed=2)
     chain.ranges[40:90, 1] += 0.8  # blocked
     found = solve(graph_of(chain, loss)).values[FIRST:]
@@ -137,7 +141,8 @@ def test_unknown_anchors_with_biases_have_the_optimum_of_scipy() -> None:
     solution = solve(graph)
     assert solution.cost == pytest.approx(reference.cost, rel=1e-7)
     np.testing.assert_allclose(solution.values[mask], reference.x, atol=2e-4)
-    inverse = np.linalg.inv(reference.jac.T @ reference.jac)
+    jac = np.asarray(reference.jac)
+    inverse = np.linalg.inv(jac.T @ jac)
     expected = np.zeros((len(mask.ravel()),) * 2)
     expected[np.ix_(mask.ravel(), mask.ravel())] = inverse
     for i, cov in enumerate(solution.covariances(graph.free)):
@@ -146,7 +151,9 @@ def test_unknown_anchors_with_biases_have_the_optimum_of_scipy() -> None:
 
 def test_noiseless_measurements_give_no_error() -> None:
     chain = drive(200, seed=11, noise=0.0)
-    np.testing.assert_allclose(pose_errors(solve(graph_of(chain)).values[FIRST:], chain.truth), 0.0, atol=1e-6)
+    np.testing.assert_allclose(
+        pose_errors(solve(graph_of(chain)).values[FIRST:], chain.truth), 0.0, atol=1e-6
+    )
 
 
 def test_nees_of_all_poses_is_within_both_bounds() -> None:
@@ -157,8 +164,7 @@ def test_nees_of_all_poses_is_within_both_bounds() -> None:
         solution = solve(graph)
         errors, covs = pose_errors(solution.values[FIRST:], chain.truth), solution.covariances(graph.free)
         nees.append(errors[6] @ np.linalg.solve(covs[FIRST + 6], errors[6]))
-    low, high = chi2.ppf([0.005, 0.995], 3 * len(nees))
-    assert low < sum(nees) < high
+    assert chi2.ppf(0.005, 3 * len(nees)) < sum(nees) < chi2.ppf(0.995, 3 * len(nees))
 
 
 def test_the_start_is_left_as_it_was() -> None:
@@ -182,12 +188,12 @@ def test_an_anchor_without_ranges_is_named() -> None:
     graph = named(graph_of(drive(30, seed=14)))
     graph.free[2] = factors.ALL
     graph.ranges = graph.ranges[graph.ranges[:, 1] != 2]
-    with pytest.raises(GraphError, match=r"anchor 2: .* bear on it: 0, at least 3"):
+    with pytest.raises(GraphError, match=r"anchor 2: no measured numbers bear on it, at least 3"):
         solve(graph)
     graph = named(graph_of(drive(30, seed=14)))
     graph.free[2] = factors.ALL
     graph.ranges = np.delete(graph.ranges, np.flatnonzero(graph.ranges[:, 1] == 2)[2:], axis=0)
-    with pytest.raises(GraphError, match=r"anchor 2: .* bear on it: 2, at least 3"):
+    with pytest.raises(GraphError, match=r"anchor 2: 2 measured numbers bear on it, at least 3"):
         solve(graph)
 
 
