@@ -1,4 +1,4 @@
-"""A log smoothed as a whole: the course that fits all of it best, and anchors where the ranges say they are."""
+"""A log smoothed as a whole: the course that fits all of it best, and anchors where ranges say they are."""
 
 import time
 from collections.abc import Callable, Sequence

@@ -36,8 +36,8 @@ def check(graph: Graph) -> None:
     if len(short):
         i = int(short[0])
         raise GraphError(
-            f"{graph.name(i)}: {equations[i] or 'no'} measured numbers bear on it, at least {unknowns[i]:.0f} "
-            "are needed"
+            f"{graph.name(i)}: {equations[i] or 'no'} measured numbers bear on it, at least "
+            f"{unknowns[i]:.0f} are needed"
         )
     _check_anchoring(graph, free)
 
@@ -97,6 +97,6 @@ def _check_anchoring(graph: Graph, free: BoolArray) -> None:
         i = int(loose[0])
         others = int((part == part[i]).sum()) - 1
         raise GraphError(
-            f"{graph.name(i)}: nothing holds it{f' and {others} others' * (others > 0)} in place, no prior and "
-            "nothing known"
+            f"{graph.name(i)}: nothing holds it{f' and {others} others' * (others > 0)} in place, no prior "
+            "and nothing known"
         )

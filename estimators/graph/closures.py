@@ -1,8 +1,8 @@
 """Loop closures of which some are wrong: graduated non-convexity.
 
-A wrong closure is not noise: it must not count at all. The loss wanted is quadratic up to a limit and flat beyond
-(truncated least squares), which no Newton method gets to from afar. So a convex relative of it is solved
-first, and made more like it in rounds, until every closure counts in full or not at all.
+A wrong closure is not noise: it must not count at all. The loss wanted is quadratic up to a limit and flat
+beyond (truncated least squares), which no Newton method gets to from afar. So a convex relative of it is
+solved first, and made more like it in rounds, until every closure counts in full or not at all.
 """
 
 from dataclasses import replace

@@ -1,9 +1,9 @@
 """A graph over the last seconds: what is older is kept as what it says of the rest (fixed-lag smoothing).
 
-A node is the state at one instant: a pose and the velocity after it, or a pose alone. Nodes are in the order of
-time, behind the variables that do not move. Those older than the lag are marginalised: the factors on them are
-linearised for good and become a quadratic on the nodes that they share factors with. Time and memory of an
-update are bounded by the nodes within the lag.
+A node is the state at one instant: a pose and the velocity after it, or a pose alone. Nodes are in the order
+of time, behind the variables that do not move. Those older than the lag are marginalised: the factors on them
+are linearised for good and become a quadratic on the nodes that they share factors with. Time and memory of
+an update are bounded by the nodes within the lag.
 
 Source: Dong-Si and Mourikis, ICRA 2011, fixed-lag smoothing by marginalisation.
 """

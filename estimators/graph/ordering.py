@@ -16,8 +16,8 @@ def elimination_order(graph: GraphArrays) -> tuple[IntArray, int]:
     """Place of every variable in the order of elimination.
 
     At first each variable goes when the last factor on it has come, as in a filter: for chains, with
-    landmarks that pass by, nothing is better. Where that leaves many open ends (loop closures), it is compared
-    with the order of minimum degree.
+    landmarks that pass by, nothing is better. Where that leaves many open ends (loop closures), it is
+    compared with the order of minimum degree.
 
     Args:
         graph: as the kernels take it.

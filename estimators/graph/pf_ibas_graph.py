@@ -1,10 +1,8 @@
-"""The full method of huang2024: PF-IBAS gives each step's pose and refuses blocked ranges, a graph follows."""
-
-import numpy as np
+"""The full method of huang2024: PF-IBAS poses each step and refuses blocked ranges, a graph follows."""
 
 from estimators.base import Report, Setup, Verdict
 from estimators.geometry import wrap_angle
-from estimators.graph.smoother import POSE, STATE, GraphSmoother
+from estimators.graph.smoother import GraphSmoother
 from estimators.messages import FloatArray, LandmarkFrame, Measurement, RangeFrame
 from estimators.pf_ibas import PfIbas
 

@@ -189,7 +189,8 @@ class Recording:
         ends = [self._variable(np.array([m.from_stamp_ns, m.stamp_ns])) for m in steps]
         first, second = np.array(ends).T
         measured, covs = np.array([m.increment for m in steps]), np.array([m.cov for m in steps])
-        return factors.increments(first, second, measured, covs, _INCREMENT_LOSS)[first != second]
+        rows = factors.increments(first, second, measured, covs, _INCREMENT_LOSS)
+        return np.asarray(rows[first != second])
 
 
 def _is_step(measured: PoseIncrement) -> bool:

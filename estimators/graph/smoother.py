@@ -260,7 +260,7 @@ class GraphSmoother(KeyframeTracker):
         return F @ self._mean, 0.5 * (cov + cov.T)
 
     def _node_of(self, stamp_ns: int) -> int | None:
-        """The node of an instant, made if there is none yet; None when the window does not reach back to it."""
+        """The node of an instant, made if there is none yet; None when the window does not reach back."""
         window = self._window
         nearest = window.nearest(stamp_ns)
         if abs(int(window.stamps_ns[nearest]) - stamp_ns) < SAME_NS:

@@ -10,7 +10,7 @@ from math import sqrt
 
 import numpy as np
 
-from estimators.kernels.compilation import INDICES, MATRIX, VECTOR, compiled
+from estimators.kernels.compilation import INDICES, MATRIX, compiled
 from estimators.messages import FloatArray, IntArray
 
 BLOCKS = "float64[:, :, ::1]"

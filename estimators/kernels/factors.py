@@ -1,7 +1,7 @@
 """Factors of a graph: residual, loss, and what each adds to the normal equations.
 
-The functions here are those of `estimators.models` and `estimators.graph.losses`, against which the tests hold
-them. A graph is a tuple of matrices; `estimators.graph.factors` says what their rows are. A system is a
+The functions here are those of `estimators.models` and `estimators.graph.losses`, against which the tests
+hold them. A graph is a tuple of matrices; `estimators.graph.factors` says what their rows are. A system is a
 tuple of elimination order, pattern of the factor (`kernels.block_cholesky`) and slots: for each factor the
 places of its blocks off the diagonal.
 """
@@ -31,7 +31,7 @@ GraphArrays: TypeAlias = tuple[
 Slots: TypeAlias = tuple[IntArray, IntArray, IntArray, IntArray, IntArray]
 System: TypeAlias = tuple[IntArray, IntArray, IntArray, Slots]
 
-GRAPH = f"Tuple(({MATRIX}, {MATRIX}, {MATRIX}, {MATRIX}, {MATRIX}, {MATRIX}, {INDICES}, {MATRIX}, {MATRIX}, {VECTOR}))"
+GRAPH = f"Tuple(({', '.join([MATRIX] * 6)}, {INDICES}, {MATRIX}, {MATRIX}, {VECTOR}))"
 _TABLE = "int64[:, ::1]"
 SLOTS = f"Tuple(({INDICES}, {INDICES}, {INDICES}, {_TABLE}, {_TABLE}))"
 SYSTEM = f"Tuple(({INDICES}, {INDICES}, {INDICES}, {SLOTS}))"
@@ -156,7 +156,8 @@ def loss(kind: float, scale: float, square: float, sign: float) -> tuple[float, 
 
 
 @compiled(
-    f"void({MATRIX}, {BLOCKS}, {BLOCKS}, {INDICES}, int64, int64, int64, {MATRIX}, {MATRIX}, {MATRIX}, {VECTOR}, int64)"
+    f"void({MATRIX}, {BLOCKS}, {BLOCKS}, {INDICES}, int64, int64, int64, "
+    f"{MATRIX}, {MATRIX}, {MATRIX}, {VECTOR}, int64)"
 )
 def _add(
     gradient: FloatArray,

@@ -60,9 +60,9 @@ def test_anchors_are_found_where_the_site_file_has_one_wrong(short_log: Path) ->
 
 
 def test_a_log_without_anything_to_smooth_is_one_line(short_log: Path) -> None:
+    config = load_config(SITE)
+    other = config.model_copy(update={"sensor": {"other": config.sensor["uwb"]}})
     with pytest.raises(UserError, match=r"no bytes of the site's sensors"):
-        config = load_config(SITE, ["sensor.uwb.driver=linktrack"])
-        other = config.model_copy(update={"sensor": {"other": config.sensor["uwb"]}})
         smooth_log(Log(short_log), other, find_anchors=False, find_biases=False)
 
 

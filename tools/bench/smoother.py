@@ -19,7 +19,7 @@ try:
 
     from tests.estimators.graph.gtsam_graphs import gtsam_graph
 except ImportError:  # an extra
-    gtsam = None
+    gtsam = None  # type: ignore[assignment]
 
 WINDOW, UPDATES = 200, 500
 """Poses in the window; updates of a run, which begins with an empty window."""

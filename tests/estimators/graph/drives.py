@@ -1,6 +1,7 @@
-"""Drives whose graphs several tests solve: a circle in a room of 10 m, increments, ranges, closures, landmarks."""
+"""Drives whose graphs several tests solve: a circle in a room of 10 m, with all that may be measured."""
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -45,7 +46,7 @@ def drive(count: int, seed: int, noise: float = 1.0, dt: float = 0.1) -> Drive:
     truth = np.column_stack(
         [5 + 4 * np.cos(0.1 * times), 5 + 4 * np.sin(0.1 * times), 0.1 * times + np.pi / 2]
     )
-    steps = np.array([between(a, b) for a, b in zip(truth[:-1], truth[1:], strict=True)]).reshape(-1, 3)
+    steps = np.array([between(a, b) for a, b in pairwise(truth)]).reshape(-1, 3)
     steps += noise * STEP_SIGMA * rng.standard_normal(steps.shape)
     ranges = np.linalg.norm(truth[:, None, :2] - ANCHORS, axis=2)
     ranges += noise * RANGE_SIGMA * rng.standard_normal(ranges.shape)

@@ -44,7 +44,7 @@ def dense_system(graph: Graph, values: FloatArray) -> tuple[float, FloatArray, F
 
 
 def graphs(loss: Loss) -> dict[str, Graph]:
-    """A graph with one factor of each kind; variable 0 is an anchor or landmark, the others poses and speeds."""
+    """A graph with one factor of each kind; variable 0 is an anchor or landmark."""
     values, free = np.zeros((5, 3)), np.ones((5, 3))
     dense = DensePrior(
         np.array([1, 3]),
