@@ -26,6 +26,7 @@ from companion.config import default_toml, load_config, params_dir
 from companion.doctor import app as doctor
 from companion.errors import UserError
 from companion.evaluate_cli import app as evaluate_app
+from companion.smooth_cli import smooth
 
 if TYPE_CHECKING:
     from companion.live import LiveRun, LiveStatus
@@ -55,6 +56,7 @@ app = typer.Typer(
 )
 app.add_typer(doctor, name="doctor")
 app.add_typer(evaluate_app, name="evaluate", cls=_ScenarioUnlessNamed)
+app.command()(smooth)
 out = Console()
 err = Console(stderr=True, highlight=False)
 

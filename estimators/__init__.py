@@ -10,9 +10,11 @@ from estimators.base import Estimator, Settable, Setup
 ESTIMATORS: dict[str, tuple[str, str]] = {
     "ekf": ("estimators.ekf", "Ekf"),
     "least_squares": ("estimators.least_squares", "LeastSquares"),
+    "graph": ("estimators.graph.smoother", "GraphSmoother"),
     "lidar_odometry": ("estimators.lidar.odometry", "LidarOdometry"),
     "pf": ("estimators.particle_filter", "ParticleFilter"),
     "pf_ibas": ("estimators.pf_ibas", "PfIbas"),
+    "pf_ibas_graph": ("estimators.graph.pf_ibas_graph", "PfIbasGraph"),
     "pf_ibas_printed": ("estimators.pf_ibas", "PrintedPfIbas"),
 }
 """Name on the command line -> module and class. The class has a nested pydantic `Config`."""

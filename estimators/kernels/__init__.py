@@ -1,4 +1,4 @@
-"""Inner loops of the particle filters, compiled by numba.
+"""Inner loops of the particle filters and of factor graphs, compiled by numba.
 
 Import these modules only where a filter is made: numba loads slowly. What is compiled is kept on disk, so
 only the very first start takes the compiler's time. The tests hold every function against plain NumPy.

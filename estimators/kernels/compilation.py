@@ -9,7 +9,7 @@ from numba import njit
 
 Function = TypeVar("Function", bound=Callable[..., object])
 
-MATRIX, VECTOR = "float64[:, ::1]", "float64[::1]"
+MATRIX, VECTOR, INDICES = "float64[:, ::1]", "float64[::1]", "int64[::1]"
 
 
 def _digest_of_kernels() -> str:

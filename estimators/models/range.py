@@ -77,3 +77,25 @@ def horizontal_range(pose: FloatArray, anchor: FloatArray, lever_arm: FloatArray
     distance = max(hypot(dx, dy), 1e-9)
     ux, uy = dx / distance, dy / distance
     return distance, np.array([ux, uy, uy * arm_x - ux * arm_y])
+
+
+def slant_range(
+    pose: FloatArray, anchor: FloatArray, lever_arm: FloatArray, height: float
+) -> tuple[float, FloatArray, FloatArray]:
+    """Predicted slant range and its Jacobians, for anchors whose place or bias is to be found.
+
+    Args:
+        pose: (3,) x [m], y [m], yaw [rad] of the body in the map.
+        anchor: (3,) x [m], y [m] in the map and bias of its ranges [m].
+        lever_arm: (2,) or (3,) tag antenna in the body frame [m]; only x and y are used.
+        height: of the anchor above the tag [m].
+
+    Returns:
+        Range [m]; its derivatives by the pose, (3,), and by the anchor, (3,).
+
+    Source: huang2024 Eq. (2)-(3), without reduction to the plane: a bias belongs to the slant range.
+    """
+    horizontal, by_pose = horizontal_range(pose, anchor, lever_arm)
+    slant = hypot(horizontal, height)
+    by_pose = by_pose * (horizontal / slant)
+    return slant + float(anchor[2]), by_pose, np.array([-by_pose[0], -by_pose[1], 1.0])

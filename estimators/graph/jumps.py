@@ -1,0 +1,27 @@
+"""When a correction is a jump: the one place that decides on `PoseEstimate.reset_counter`."""
+
+import numpy as np
+from scipy.stats import chi2
+
+from estimators.geometry import wrap_angle
+from estimators.messages import FloatArray
+
+_LIMIT = float(chi2.ppf(1.0 - 1e-6, 3))
+"""What a covariance explains of a correction, but for one in a million."""
+_LEAST = np.array([0.05, 0.05, np.deg2rad(2.0)])
+"""Corrections below these [m, m, rad] are no jump, however sure the estimate was."""
+
+
+def is_jump(before: FloatArray, cov: FloatArray, after: FloatArray) -> bool:
+    """Whether an estimate moved farther than it said that it could be off.
+
+    An autopilot that fuses poses must be told of such a step, or takes it for motion.
+
+    Args:
+        before: (3,) x [m], y [m], yaw [rad] given out, or predicted, for an instant.
+        cov: (3, 3) its covariance then.
+        after: (3,) the same pose now that more is known.
+    """
+    step = after - before
+    step[2] = wrap_angle(step[2])
+    return bool((np.abs(step) > _LEAST).any() and step @ np.linalg.solve(cov, step) > _LIMIT)

@@ -1,0 +1,49 @@
+"""The full method of huang2024: PF-IBAS poses each step and refuses blocked ranges, a graph follows."""
+
+from estimators.base import Report, Setup, Verdict
+from estimators.geometry import wrap_angle
+from estimators.graph.smoother import GraphSmoother
+from estimators.messages import FloatArray, LandmarkFrame, Measurement, RangeFrame
+from estimators.pf_ibas import PfIbas
+
+
+class PfIbasGraph(GraphSmoother):
+    """Fixed-lag smoother behind a particle filter.
+
+    The filter takes every measurement first. A range that it refuses does not get into the graph, and its
+    pose is where the search for a new node begins. What is given out is the graph's.
+
+    Source: huang2024 Eq. (15)-(38).
+    """
+
+    class Config(PfIbas.Config, GraphSmoother.Config):
+        """Settings of `pf_ibas_graph`."""
+
+    def __init__(self, config: Config, setup: Setup) -> None:
+        self._filter = PfIbas(config, setup)
+        super().__init__(config, setup)
+
+    def reset(self) -> None:
+        """Stand at the start again, filter and graph."""
+        self._filter.reset()
+        super().reset()
+
+    def update(self, measurement: Measurement) -> Report:
+        """Take one measurement, the filter first; what comes late the graph takes alone."""
+        self._said = self._filter.update(measurement)
+        return super().update(measurement)
+
+    def _judge(self, frame: RangeFrame | LandmarkFrame, mean: FloatArray, cov: FloatArray) -> Report:
+        if not isinstance(frame, RangeFrame) or Verdict.LATE in self._said.verdicts:
+            return super()._judge(frame, mean, cov)
+        rows = self._judging.believed_ranges(
+            self._gate, frame, self._said.verdicts, self._setup.tag_in_body, self._anchor_numbers
+        )
+        return self._taken(frame.stamp_ns, "ranges", rows, self._said)
+
+    def _guess(self, stamp_ns: int) -> FloatArray:
+        state, pose = super()._guess(stamp_ns), self._filter.pose_at(stamp_ns)
+        if pose is not None:
+            turn = wrap_angle(pose.yaw - float(state[0, 2]))
+            state[0] = *pose.xy, state[0, 2] + turn
+        return state

@@ -1,0 +1,295 @@
+"""The pose of now from a graph over the last seconds: increments, ranges, landmarks and smooth motion.
+
+Every measurement that is believed gets a node at its instant, or joins the one that is there. Nodes hang
+together by constant velocity and by increments from keyframes. Whether a measurement is believed is
+decided by its NIS against the state predicted to its instant. What comes late goes where it belongs.
+"""
+
+import numpy as np
+from pydantic import Field
+from scipy.stats import chi2
+
+from estimators.base import Report, Setup, Verdict
+from estimators.geometry import lift, wrap_angle
+from estimators.graph import factors
+from estimators.graph.errors import GraphError
+from estimators.graph.jumps import is_jump
+from estimators.lidar.keyframes import START_SPEED_SIGMA, KeyframeTracker, is_covariance
+from estimators.lidar.odometry import MAX_HEADING_SIGMA
+from estimators.messages import (
+    FloatArray,
+    LandmarkFrame,
+    Measurement,
+    PoseEstimate,
+    PoseIncrement,
+    RangeFrame,
+)
+from estimators.models.motion import constant_velocity, increment
+from estimators.range_gate import RangeGate
+
+SAME_NS = 1_000_000
+"""Measurements within this time share a node: it saves a motion of no length, and costs 1 mm at 1 m/s."""
+POSE, STATE, REFERENCE = slice(0, 3), slice(0, 6), slice(6, 9)
+_WIDEST = np.array([100.0, 100.0, np.pi, 10.0, 10.0, 10.0])
+"""Standard deviations [m, rad, m/s, rad/s] beyond which a window that begins anew knows nothing at all."""
+
+
+class GraphSmoother(KeyframeTracker):
+    """Fixed-lag smoother on ranges, increments and landmarks, begun by dead reckoning from the start.
+
+    What it tells of now is a mean and covariance of pose, velocity and the keyframe's pose, (9,), as `ekf`
+    has them, but after all of the window has been solved anew.
+
+    Source: huang2024 Eq. (29)-(38).
+    """
+
+    class Config(RangeGate.Config, KeyframeTracker.Config):
+        """Settings of `graph`."""
+
+        lag: float = Field(3.0, gt=0, le=60, description="the window reaches back so far [s]")
+        landmark_gate: float = Field(
+            0.99999, gt=0.5, lt=1, description="share of good sightings of a landmark that pass the NIS gate"
+        )
+
+    def __init__(self, config: Config, setup: Setup) -> None:
+        # Numba loads slowly: only who makes a smoother waits for it.
+        from estimators.graph import fixed_lag, judging
+
+        super().__init__(config, setup)
+        self._fixed_lag, self._judging = fixed_lag, judging
+        self._lag_ns = round(config.lag * 1e9)
+        self._gate = RangeGate(config, setup)
+        self._landmark_gate = float(chi2.ppf(config.landmark_gate, 2))
+        self._anchor_numbers = {anchor_id: i for i, anchor_id in enumerate(setup.anchors)}
+        self._landmark_numbers = {i: len(setup.anchors) + k for k, i in enumerate(setup.landmarks)}
+        places = [*(p[:2] for p in setup.anchors.values()), *setup.landmarks.values()]
+        self._known = np.array([[*place, 0.0] for place in places]).reshape(-1, 3)
+        self._keyframes: dict[int, int] = {}
+        self.reset()
+
+    def reset(self) -> None:
+        """Stand at the start again and trust every anchor."""
+        super().reset()
+        self._gate.reset()
+        start = self._setup.start
+        self._mean = np.concatenate([start.pose, np.zeros(3), start.pose])
+        spread = np.concatenate([start.sigma, np.full(3, START_SPEED_SIGMA), start.sigma])
+        self._cov = np.diag(spread**2)
+        self._heading_known = True
+        self._resets = 0
+        self._begin_window(0)
+
+    @property
+    def state(self) -> tuple[FloatArray, FloatArray]:
+        """State (9,) and covariance (9, 9) at the newest node, for tests."""
+        return self._mean.copy(), self._cov.copy()
+
+    def update(self, measurement: Measurement) -> Report:
+        """Take one measurement; late ones too, within the window. Scans and inertial sensors are not used."""
+        if isinstance(measurement, RangeFrame | LandmarkFrame | PoseIncrement):
+            if self._is_late(measurement.stamp_ns):
+                return self._update_late(measurement)
+            if not isinstance(measurement, PoseIncrement):
+                self._predict_to(measurement.stamp_ns)
+                return self._judge(measurement, *self._predicted(measurement.stamp_ns))
+        return super().update(measurement)
+
+    def pose_at(self, stamp_ns: int) -> PoseEstimate | None:
+        """Newest pose predicted with constant velocity; None before the first measurement.
+
+        The variance of yaw is infinite once the heading was lost, until reset, as in `ekf`.
+        """
+        if self._stamp_ns is None:
+            return None
+        mean, cov = self._predicted(stamp_ns)
+        cov = cov[POSE, POSE].copy()
+        if not self._heading_known:
+            cov[2, :2] = cov[:2, 2] = 0.0
+            cov[2, 2] = np.inf
+        T_map_body = lift(mean[POSE], self._setup.height)
+        return PoseEstimate(stamp_ns, T_map_body, self._setup.lift_covariance(cov), self._resets)
+
+    def _set_speed_free(self) -> None:
+        """Its speed always is; while it stands, nothing is predicted with it."""
+
+    def _move(self, dt: float) -> None:
+        """Nodes come with measurements that are believed."""
+
+    def _begin_anew(self) -> None:
+        assert self._stamp_ns is not None
+        _, cov = self._predicted(self._stamp_ns)
+        self._heading_known &= bool(cov[2, 2] < MAX_HEADING_SIGMA**2)
+
+    def _predict_to(self, stamp_ns: int) -> None:
+        super()._predict_to(stamp_ns)
+        if self._stands:
+            self._window.stamps_ns[-1] = stamp_ns
+            self._keyframes = dict.fromkeys(self._keyframes, stamp_ns)
+
+    def _follow(self, measured: PoseIncrement) -> Report:
+        mean, cov = self._predicted(measured.stamp_ns)
+        predicted, by_reference, by_pose = increment(mean[REFERENCE], mean[POSE])
+        H = np.zeros((3, 9))
+        H[:, POSE], H[:, REFERENCE] = by_pose, by_reference
+        nis = _increment_nis(measured, predicted, H @ cov @ H.T)
+        passes = nis <= self._increment_gate and self._take_increment(measured)
+        return Report((Verdict.ACCEPTED if passes else Verdict.GATED,), np.full(1, np.nan), np.array([nis]))
+
+    def _take_reference(self) -> None:
+        assert self._stamp_ns is not None
+        self._keep_keyframe(self._stamp_ns)
+        for block in (self._mean, self._cov, self._cov.T):
+            block[REFERENCE] = block[POSE]
+
+    def _judge(self, frame: RangeFrame | LandmarkFrame, mean: FloatArray, cov: FloatArray) -> Report:
+        """Take what is believed of a frame, against the state at its instant."""
+        belief = self._judging.Belief(mean[STATE], cov[STATE, STATE])
+        if isinstance(frame, RangeFrame):
+            report, rows = self._judging.judge_ranges(
+                self._gate, frame, belief, self._setup.tag_in_body, self._anchor_numbers
+            )
+            table = "ranges"
+        else:
+            verdict, rows = self._judging.judge_landmarks(
+                self._landmark_gate, frame, belief, self._setup.landmarks, self._landmark_numbers
+            )
+            report, table = Report((verdict,)), "sightings"
+        return self._taken(frame.stamp_ns, table, rows, report)
+
+    def _taken(self, stamp_ns: int, table: str, rows: FloatArray, report: Report) -> Report:
+        """Take factors; the report, unless the graph cannot be solved with them."""
+        if len(rows) == 0 or self._take(stamp_ns, table, rows):
+            return report
+        gated = (Verdict.GATED if v is Verdict.ACCEPTED else v for v in report.verdicts)
+        return Report(tuple(gated), report.residuals, report.nis)
+
+    def _update_late(self, measurement: RangeFrame | LandmarkFrame | PoseIncrement) -> Report:
+        """Take a measurement at an instant that was passed, if the window reaches back to it."""
+        node = None if self._stands else self._node_of(measurement.stamp_ns)
+        if node is None:
+            count = len(measurement.ranges) if isinstance(measurement, RangeFrame) else 1
+            return Report((Verdict.LATE,) * count)
+        try:
+            if isinstance(measurement, PoseIncrement):
+                return Report((self._update_late_increment(measurement, node),))
+            return self._judge(measurement, *self._window.state_of(node))
+        except GraphError:
+            return Report((Verdict.LATE,))
+
+    def _update_late_increment(self, measured: PoseIncrement, node: int) -> Verdict:
+        verdict, reference = Verdict.ACCEPTED, self._node_of_keyframe(measured.from_stamp_ns)
+        if measured.from_stamp_ns != measured.stamp_ns:
+            if not (np.isfinite(measured.increment).all() and is_covariance(measured.cov)):
+                verdict = Verdict.IMPOSSIBLE
+            elif reference is None:
+                verdict = Verdict.NO_REFERENCE
+            else:
+                # The two poses are taken for independent, which makes the gate wider than need be.
+                (earlier, cov_earlier), (later, cov_later) = map(self._window.state_of, (reference, node))
+                predicted, by_reference, by_pose = increment(earlier[POSE], later[POSE])
+                spread = by_reference @ cov_earlier[POSE, POSE] @ by_reference.T
+                spread += by_pose @ cov_later[POSE, POSE] @ by_pose.T
+                passes = _increment_nis(measured, predicted, spread) <= self._increment_gate
+                if not (passes and self._take_increment(measured)):
+                    verdict = Verdict.GATED
+        if measured.is_keyframe:
+            self._keep_keyframe(measured.stamp_ns)
+        return verdict
+
+    def _take_increment(self, measured: PoseIncrement) -> bool:
+        node = self._node_of(measured.stamp_ns)
+        reference = self._node_of_keyframe(measured.from_stamp_ns)
+        if node is None or reference is None or node == reference:
+            return False
+        rows = factors.increments(self._window.variable(reference), -1, measured.increment, measured.cov)
+        return self._take(measured.stamp_ns, "increments", rows)
+
+    def _take(self, stamp_ns: int, table: str, rows: FloatArray) -> bool:
+        """Add factors on the node of an instant, which has the number -1 in them, and solve."""
+        node = self._node_of(stamp_ns)
+        assert node is not None
+        rows[:, :2] = np.where(rows[:, :2] < 0, self._window.variable(node), rows[:, :2])
+        self._window.add(**{table: rows})
+        return self._solve()
+
+    def _solve(self) -> bool:
+        """Bring the window to its optimum; or begin it anew without the newest factors, if it has none."""
+        window = self._window
+        reference = self._node_of_keyframe(self._reference_stamp_ns)
+        if reference == len(window.stamps_ns) - 1:
+            reference = None
+        try:
+            cov = window.update(reference)
+        except GraphError:
+            self._begin_window(int(window.stamps_ns[-1]))
+            return False
+        mean = window.newest.ravel()
+        if reference is None:
+            pick = np.r_[STATE, POSE]
+            mean, cov = mean[pick], cov[np.ix_(pick, pick)]
+        else:
+            mean = np.concatenate([mean, window.graph.values[window.variable(reference)]])
+        self._resets += is_jump(self._mean[POSE], self._cov[POSE, POSE], mean[POSE])
+        self._mean, self._cov = mean, cov
+        if self._stands:
+            window.absorb()
+            return True
+        kept = () if self._reference_stamp_ns is None else (self._keyframes.get(self._reference_stamp_ns, 0),)
+        window.drop_before(int(window.stamps_ns[-1]) - self._lag_ns, kept)
+        oldest_ns = window.stamps_ns[0]
+        self._keyframes = {k: node_ns for k, node_ns in self._keyframes.items() if node_ns >= oldest_ns}
+        return True
+
+    def _begin_window(self, stamp_ns: int) -> None:
+        """Begin a window with what is known of the state at an instant, and nothing else."""
+        sigma = np.sqrt(np.diag(self._cov)[STATE])
+        scale = np.minimum(1.0, _WIDEST / sigma)
+        self._window = self._fixed_lag.FixedLag(self._known, width=2)
+        self._window.begin(
+            stamp_ns, self._mean[STATE].reshape(2, 3), self._cov[STATE, STATE] * np.outer(scale, scale)
+        )
+        self._keyframes = {}
+        self._reference_stamp_ns = None
+
+    def _predicted(self, stamp_ns: int) -> tuple[FloatArray, FloatArray]:
+        """State (9,) and covariance (9, 9) at an instant near the newest node."""
+        dt = 0.0 if self._stands else (stamp_ns - int(self._window.stamps_ns[-1])) * 1e-9
+        F, Q = np.eye(9), np.zeros((9, 9))
+        F[STATE, STATE], Q[STATE, STATE] = constant_velocity(dt, *self._accel_noise)
+        cov = F @ self._cov @ F.T + Q
+        return F @ self._mean, 0.5 * (cov + cov.T)
+
+    def _node_of(self, stamp_ns: int) -> int | None:
+        """The node of an instant, made if there is none yet; None when the window does not reach back."""
+        window = self._window
+        nearest = window.nearest(stamp_ns)
+        if abs(int(window.stamps_ns[nearest]) - stamp_ns) < SAME_NS:
+            return nearest
+        newest_ns = int(window.stamps_ns[-1])
+        if stamp_ns < newest_ns:
+            return window.interpolate(stamp_ns)
+        self._mean, self._cov = self._predicted(stamp_ns)
+        node = window.insert(stamp_ns, self._guess(stamp_ns))
+        ends = window.variable(node - 1), window.variable(node)
+        window.add(motions=factors.motions(*ends, (stamp_ns - newest_ns) * 1e-9, *self._accel_noise))
+        return node
+
+    def _guess(self, stamp_ns: int) -> FloatArray:  # noqa: ARG002
+        """State (2, 3) that the search for a new node begins at."""
+        return self._mean[STATE].reshape(2, 3).copy()
+
+    def _keep_keyframe(self, stamp_ns: int) -> None:
+        node = self._node_of(stamp_ns)
+        if node is not None:
+            self._keyframes[stamp_ns] = int(self._window.stamps_ns[node])
+
+    def _node_of_keyframe(self, stamp_ns: int | None) -> int | None:
+        node_ns = None if stamp_ns is None else self._keyframes.get(stamp_ns)
+        return None if node_ns is None else self._window.node_at(node_ns)
+
+
+def _increment_nis(measured: PoseIncrement, predicted: FloatArray, spread: FloatArray) -> float:
+    """Normalised innovation squared of an increment, whose prediction has a covariance (3, 3)."""
+    residual = measured.increment - predicted
+    residual[2] = wrap_angle(residual[2])
+    return float(residual @ np.linalg.solve(spread + measured.cov, residual))
