@@ -149,7 +149,8 @@ class HealthMonitor:
 
     def _begin_agreement(self) -> None:
         """No pose is believed, at the start or after a reset, before ranges agreed with it for a while."""
-        self._accepted_share = self._short_share = 0.0
+        self._accepted_share: float = 0.0
+        self._short_share: float = 0.0
         self._agrees = False
 
     def _judge_agreement(self) -> None:
