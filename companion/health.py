@@ -109,6 +109,8 @@ class HealthMonitor:
         self._has_ranges = has_ranges
         self._has_scans = has_scans
         self._resets = 0
+        self._accepted_share: float
+        self._short_share: float
         self._has_agreed = False
         self._begin_agreement()
         self._share_stamp_ns: int | None = None
@@ -149,8 +151,7 @@ class HealthMonitor:
 
     def _begin_agreement(self) -> None:
         """No pose is believed, at the start or after a reset, before ranges agreed with it for a while."""
-        self._accepted_share: float = 0.0
-        self._short_share: float = 0.0
+        self._accepted_share = self._short_share = 0.0
         self._agrees = False
 
     def _judge_agreement(self) -> None:
