@@ -109,6 +109,8 @@ class HealthMonitor:
         self._has_ranges = has_ranges
         self._has_scans = has_scans
         self._resets = 0
+        self._accepted_share: float
+        self._short_share: float
         self._has_agreed = False
         self._begin_agreement()
         self._share_stamp_ns: int | None = None
