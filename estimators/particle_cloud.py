@@ -89,6 +89,11 @@ class ParticleCloud(KeyframeTracker):
         """Particles (N, 9) and weights (N,) at the newest measurement, for tests and pictures."""
         return self._particles.copy(), self._weights.copy()
 
+    @property
+    def gate(self) -> RangeGate:
+        """What judges ranges, for those who take up where the cloud leaves off."""
+        return self._gate
+
     def update(self, measurement: Measurement) -> Report:
         """Predict to the measurement's time and take it; scans only show what blocks ranges."""
         if isinstance(measurement, RangeFrame):

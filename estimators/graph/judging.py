@@ -6,17 +6,17 @@ believed before it, as an extended Kalman filter does.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from math import isfinite
 
 import numpy as np
 
 from estimators.base import Report, Verdict
 from estimators.geometry import wrap_angle
 from estimators.graph import factors
+from estimators.landmark_gate import LandmarkGate
 from estimators.messages import FloatArray, LandmarkFrame, RangeFrame
 from estimators.models.landmark import range_and_bearing
 from estimators.models.range import horizontal_range
-from estimators.range_gate import RangeGate
+from estimators.range_gate import HorizontalRanges, RangeGate
 
 
 @dataclass(slots=True, eq=False)
@@ -31,10 +31,9 @@ class Belief:
     mean: FloatArray
     cov: FloatArray
 
-    def nis(self, residual: FloatArray, by_pose: FloatArray, noise: FloatArray) -> float:
-        """Normalised innovation squared of a measurement (M,) with Jacobian (M, 3) and noise (M, M)."""
-        S = by_pose @ self.cov[:3, :3] @ by_pose.T + noise
-        return float(residual @ np.linalg.solve(S, residual))
+    def spread(self, by_pose: FloatArray, noise: FloatArray) -> FloatArray:
+        """Covariance (M, M) of residuals of measurements with Jacobian (M, 3) and noise (M, M)."""
+        return by_pose @ self.cov[:3, :3] @ by_pose.T + noise
 
     def correct(self, residual: FloatArray, by_pose: FloatArray, noise: FloatArray) -> None:
         """Take the measurement."""
@@ -63,88 +62,86 @@ def judge_ranges(
     count = len(frame.ranges)
     verdicts = [Verdict.ACCEPTED] * count
     residuals, nis = np.full(count, np.nan), np.full(count, np.nan)
-    for i, item in enumerate(gate.horizontal(frame)):
-        if isinstance(item, Verdict):
-            verdicts[i] = item
+    believed = []
+    for i, candidate in enumerate(gate.candidates(frame, belief.mean[:3])):
+        if isinstance(candidate, Verdict):
+            verdicts[i] = candidate
             continue
-        anchor, measured, sigma = item
-        predicted, by_pose = horizontal_range(belief.mean, anchor, arm)
-        residual, H, R = np.array([measured - predicted]), by_pose[None], np.array([[sigma**2]])
-        residuals[i], nis[i] = residual[0], belief.nis(residual, H, R)
-        verdicts[i] = gate.judge(int(frame.anchor_ids[i]), frame.stamp_ns, float(nis[i]))
-        if verdicts[i] is Verdict.ACCEPTED:
-            belief.correct(residual, H, R)
-    report = Report(tuple(verdicts), residuals, nis)
-    return report, believed_ranges(gate, frame, report.verdicts, arm, numbers)
+        predicted, by_pose = horizontal_range(belief.mean, candidate.anchor, arm)
+        H, R = by_pose[None], np.array([[candidate.sigma**2]])
+        residuals[i] = candidate.measured - predicted
+        nis[i] = residuals[i] ** 2 / belief.spread(H, R).item()
+        verdicts[i], factor = gate.judge(candidate, residuals[i], nis[i])
+        if verdicts[i].is_used:
+            belief.correct(residuals[i : i + 1], H, factor**2 * R)
+            believed.append((numbers[candidate.anchor_id], candidate.measured, factor * candidate.sigma))
+    return Report(tuple(verdicts), residuals, nis), _range_rows(believed, arm)
 
 
 def believed_ranges(
-    gate: RangeGate,
+    horizontal: HorizontalRanges,
     frame: RangeFrame,
     verdicts: Sequence[Verdict],
     arm: FloatArray,
     numbers: Mapping[int, int],
 ) -> FloatArray:
-    """Ranges with the verdict `ACCEPTED` as rows of `factors.ranges`, -1 for the pose.
+    """Ranges that a filter accepted as rows of `factors.ranges`, -1 for the pose.
 
-    They are horizontal, as the gate has them: those of the filters.
+    Those that it weighed down are not among them: a verdict does not tell by how much.
+
+    Args:
+        horizontal: height reduction, as the filter's.
+        frame: the ranges.
+        verdicts: the filter's on each of them.
+        arm: (3,) tag antenna in the body frame [m].
+        numbers: anchor id -> variable in the graph.
     """
     believed = [
         (numbers[anchor_id], *item[1:])
         for anchor_id, verdict, item in zip(
-            frame.anchor_ids.tolist(), verdicts, gate.horizontal(frame), strict=True
+            frame.anchor_ids.tolist(), verdicts, horizontal.of(frame), strict=True
         )
         if verdict is Verdict.ACCEPTED and not isinstance(item, Verdict)
     ]
-    if not believed:
-        return np.empty((0, factors.RANGE))
-    anchors, measured, sigmas = np.array(believed).T
-    return factors.ranges(-1, anchors, measured, sigmas, arm[:2])
+    return _range_rows(believed, arm)
 
 
 def judge_landmarks(
-    limit: float,
+    gate: LandmarkGate,
     frame: LandmarkFrame,
     belief: Belief,
-    positions: Mapping[int, FloatArray],
-    numbers: Mapping[int, int],
+    numbers: Mapping[tuple[float, float], int],
 ) -> tuple[Verdict, FloatArray]:
     """Verdict on a look at landmarks, and those that are believed as factors.
 
     Args:
-        limit: greatest NIS of a range and bearing that passes.
+        gate: decides.
         frame: what was seen.
         belief: state at the frame's instant; it is corrected.
-        positions: landmark id -> (2,) in the map [m].
-        numbers: landmark id -> variable in the graph.
+        numbers: place of a landmark in the map [m] -> variable in the graph.
 
     Returns:
-        The verdict; rows of `factors.sightings`, the pose still to be filled in.
+        The verdict; rows of `factors.sightings`, -1 for the pose.
     """
-    known = [i for i, landmark_id in enumerate(frame.landmark_ids.tolist()) if landmark_id in positions]
-    if not known:
-        return Verdict.NOT_USED, np.empty((0, factors.SIGHTING))
-    sigmas = frame.range_sigma, frame.bearing_sigma
-    possible = [i for i in known if _is_possible(float(frame.ranges[i]), float(frame.bearings[i]), *sigmas)]
-    rows = []
-    for i in possible:
-        landmark_id = int(frame.landmark_ids[i])
-        predicted, by_pose = range_and_bearing(belief.mean, positions[landmark_id])
-        residual = np.array([frame.ranges[i], frame.bearings[i]]) - predicted
+    landmarks, rows = gate.usable(frame), []
+    if isinstance(landmarks, Verdict):
+        return landmarks, np.empty((0, factors.SIGHTING))
+    for x, y, *measured in landmarks.tolist():
+        predicted, by_pose = range_and_bearing(belief.mean, np.array([x, y]))
+        residual = np.array(measured[:2]) - predicted
         residual[1] = wrap_angle(residual[1])
-        noise = np.diag(np.square(sigmas))
-        if belief.nis(residual, by_pose, noise) <= limit:
+        noise = np.diag(np.square(measured[2:]))
+        if (residual**2 <= gate.limit * np.diag(belief.spread(by_pose, noise))).all():
             belief.correct(residual, by_pose, noise)
-            rows.append((-1, numbers[landmark_id], frame.ranges[i], frame.bearings[i], *sigmas, 0.0, 1.0))
-    verdict = Verdict.ACCEPTED if rows else Verdict.GATED if possible else Verdict.IMPOSSIBLE
-    return verdict, np.array(rows, dtype=np.float64).reshape(-1, factors.SIGHTING)
+            rows.append((numbers[x, y], *measured))
+    if not rows:
+        return Verdict.GATED, np.empty((0, factors.SIGHTING))
+    return Verdict.ACCEPTED, factors.sightings(-1, *np.array(rows).T)
 
 
-def _is_possible(distance: float, bearing: float, range_sigma: float, bearing_sigma: float) -> bool:
-    """Whether a landmark's numbers are numbers, and positive where they must be."""
-    return (
-        0.0 < distance < np.inf
-        and isfinite(bearing)
-        and 1e-6 < range_sigma < np.inf
-        and 1e-6 < bearing_sigma < np.inf
-    )
+def _range_rows(believed: Sequence[tuple[int, float, float]], arm: FloatArray) -> FloatArray:
+    """Rows of `factors.ranges` from variables of anchors, horizontal ranges and their sigmas [m]."""
+    if not believed:
+        return np.empty((0, factors.RANGE))
+    anchors, measured, sigmas = np.array(believed).T
+    return factors.ranges(-1, anchors, measured, sigmas, arm[:2])

@@ -1,4 +1,4 @@
-"""When a correction is a jump: the one place that decides on `PoseEstimate.reset_counter`."""
+"""When a correction is a jump that `PoseEstimate.reset_counter` counts, as it does poses set from outside."""
 
 import numpy as np
 from scipy.stats import chi2

@@ -5,28 +5,36 @@ from estimators.geometry import wrap_angle
 from estimators.graph.smoother import GraphSmoother
 from estimators.messages import FloatArray, LandmarkFrame, Measurement, RangeFrame
 from estimators.pf_ibas import PfIbas
+from estimators.range_gate import HorizontalRanges
 
 
 class PfIbasGraph(GraphSmoother):
     """Fixed-lag smoother behind a particle filter.
 
-    The filter takes every measurement first. A range that it refuses does not get into the graph, and its
-    pose is where the search for a new node begins. What is given out is the graph's.
+    The filter takes every measurement first. A range that it refuses or weighs down does not get into the
+    graph, and its pose is where the search for a new node begins. What is given out is the graph's.
 
     Source: huang2024 Eq. (15)-(38).
     """
 
-    class Config(PfIbas.Config, GraphSmoother.Config):
+    class Config(PfIbas.Config, GraphSmoother.Config):  # type: ignore[misc]  # pydantic's plugin
         """Settings of `pf_ibas_graph`."""
 
     def __init__(self, config: Config, setup: Setup) -> None:
         self._filter = PfIbas(config, setup)
+        self._horizontal = HorizontalRanges(config.range_sigma, setup)
         super().__init__(config, setup)
+        self._gate = self._filter.gate
 
     def reset(self) -> None:
         """Stand at the start again, filter and graph."""
         self._filter.reset()
         super().reset()
+
+    def start_at(self, stamp_ns: int, pose: FloatArray, cov: FloatArray) -> None:
+        """Set filter and graph."""
+        self._filter.start_at(stamp_ns, pose, cov)
+        super().start_at(stamp_ns, pose, cov)
 
     def update(self, measurement: Measurement) -> Report:
         """Take one measurement, the filter first; what comes late the graph takes alone."""
@@ -37,7 +45,7 @@ class PfIbasGraph(GraphSmoother):
         if not isinstance(frame, RangeFrame) or Verdict.LATE in self._said.verdicts:
             return super()._judge(frame, mean, cov)
         rows = self._judging.believed_ranges(
-            self._gate, frame, self._said.verdicts, self._setup.tag_in_body, self._anchor_numbers
+            self._horizontal, frame, self._said.verdicts, self._setup.tag_in_body, self._anchor_numbers
         )
         return self._taken(frame.stamp_ns, "ranges", rows, self._said)
 

@@ -7,13 +7,13 @@ decided by its NIS against the state predicted to its instant. What comes late g
 
 import numpy as np
 from pydantic import Field
-from scipy.stats import chi2
 
 from estimators.base import Report, Setup, Verdict
 from estimators.geometry import lift, wrap_angle
 from estimators.graph import factors
 from estimators.graph.errors import GraphError
 from estimators.graph.jumps import is_jump
+from estimators.landmark_gate import LandmarkGate
 from estimators.lidar.keyframes import START_SPEED_SIGMA, KeyframeTracker, is_covariance
 from estimators.lidar.odometry import MAX_HEADING_SIGMA
 from estimators.messages import (
@@ -29,7 +29,7 @@ from estimators.range_gate import RangeGate
 
 SAME_NS = 1_000_000
 """Measurements within this time share a node: it saves a motion of no length, and costs 1 mm at 1 m/s."""
-POSE, STATE, REFERENCE = slice(0, 3), slice(0, 6), slice(6, 9)
+POSE, VELOCITY, REFERENCE, STATE = slice(0, 3), slice(3, 6), slice(6, 9), slice(0, 6)
 _WIDEST = np.array([100.0, 100.0, np.pi, 10.0, 10.0, 10.0])
 """Standard deviations [m, rad, m/s, rad/s] beyond which a window that begins anew knows nothing at all."""
 
@@ -43,13 +43,10 @@ class GraphSmoother(KeyframeTracker):
     Source: huang2024 Eq. (29)-(38).
     """
 
-    class Config(RangeGate.Config, KeyframeTracker.Config):
+    class Config(LandmarkGate.Config, RangeGate.Config, KeyframeTracker.Config):
         """Settings of `graph`."""
 
         lag: float = Field(3.0, gt=0, le=60, description="the window reaches back so far [s]")
-        landmark_gate: float = Field(
-            0.99999, gt=0.5, lt=1, description="share of good sightings of a landmark that pass the NIS gate"
-        )
 
     def __init__(self, config: Config, setup: Setup) -> None:
         # Numba loads slowly: only who makes a smoother waits for it.
@@ -59,25 +56,14 @@ class GraphSmoother(KeyframeTracker):
         self._fixed_lag, self._judging = fixed_lag, judging
         self._lag_ns = round(config.lag * 1e9)
         self._gate = RangeGate(config, setup)
-        self._landmark_gate = float(chi2.ppf(config.landmark_gate, 2))
+        self._landmark_gate = LandmarkGate(config, setup)
         self._anchor_numbers = {anchor_id: i for i, anchor_id in enumerate(setup.anchors)}
-        self._landmark_numbers = {i: len(setup.anchors) + k for k, i in enumerate(setup.landmarks)}
+        self._landmark_numbers = {
+            (float(x), float(y)): len(setup.anchors) + k for k, (x, y) in enumerate(setup.landmarks.values())
+        }
         places = [*(p[:2] for p in setup.anchors.values()), *setup.landmarks.values()]
         self._known = np.array([[*place, 0.0] for place in places]).reshape(-1, 3)
-        self._keyframes: dict[int, int] = {}
         self.reset()
-
-    def reset(self) -> None:
-        """Stand at the start again and trust every anchor."""
-        super().reset()
-        self._gate.reset()
-        start = self._setup.start
-        self._mean = np.concatenate([start.pose, np.zeros(3), start.pose])
-        spread = np.concatenate([start.sigma, np.full(3, START_SPEED_SIGMA), start.sigma])
-        self._cov = np.diag(spread**2)
-        self._heading_known = True
-        self._resets = 0
-        self._begin_window(0)
 
     @property
     def state(self) -> tuple[FloatArray, FloatArray]:
@@ -85,14 +71,16 @@ class GraphSmoother(KeyframeTracker):
         return self._mean.copy(), self._cov.copy()
 
     def update(self, measurement: Measurement) -> Report:
-        """Take one measurement; late ones too, within the window. Scans and inertial sensors are not used."""
+        """Take one measurement; late ones too, within the window. Scans only show what blocks ranges."""
         if isinstance(measurement, RangeFrame | LandmarkFrame | PoseIncrement):
             if self._is_late(measurement.stamp_ns):
                 return self._update_late(measurement)
             if not isinstance(measurement, PoseIncrement):
                 self._predict_to(measurement.stamp_ns)
                 return self._judge(measurement, *self._predicted(measurement.stamp_ns))
-        return super().update(measurement)
+        report = super().update(measurement)
+        self._gate.see(measurement, self.pose_at)
+        return report
 
     def pose_at(self, stamp_ns: int) -> PoseEstimate | None:
         """Newest pose predicted with constant velocity; None before the first measurement.
@@ -107,7 +95,20 @@ class GraphSmoother(KeyframeTracker):
             cov[2, :2] = cov[:2, 2] = 0.0
             cov[2, 2] = np.inf
         T_map_body = lift(mean[POSE], self._setup.height)
-        return PoseEstimate(stamp_ns, T_map_body, self._setup.lift_covariance(cov), self._resets)
+        return PoseEstimate(stamp_ns, T_map_body, self._setup.lift_covariance(cov), self._reset_counter)
+
+    def _place(self, pose: FloatArray, cov: FloatArray) -> None:
+        self._gate.reset()
+        self._mean = np.concatenate([pose, np.zeros(3), pose])
+        self._cov = np.zeros((9, 9))
+        for rows in (POSE, REFERENCE):
+            for columns in (POSE, REFERENCE):
+                self._cov[rows, columns] = cov
+        self._cov[VELOCITY, VELOCITY] = np.eye(3) * START_SPEED_SIGMA**2
+        self._heading_known = True
+        stamp_ns = self._stamp_ns
+        self._begin_window(0 if stamp_ns is None else stamp_ns)
+        self._keyframes: dict[int, int] = {} if stamp_ns is None else {stamp_ns: stamp_ns}
 
     def _set_speed_free(self) -> None:
         """Its speed always is; while it stands, nothing is predicted with it."""
@@ -151,7 +152,7 @@ class GraphSmoother(KeyframeTracker):
             table = "ranges"
         else:
             verdict, rows = self._judging.judge_landmarks(
-                self._landmark_gate, frame, belief, self._setup.landmarks, self._landmark_numbers
+                self._landmark_gate, frame, belief, self._landmark_numbers
             )
             report, table = Report((verdict,)), "sightings"
         return self._taken(frame.stamp_ns, table, rows, report)
@@ -160,21 +161,22 @@ class GraphSmoother(KeyframeTracker):
         """Take factors; the report, unless the graph cannot be solved with them."""
         if len(rows) == 0 or self._take(stamp_ns, table, rows):
             return report
-        gated = (Verdict.GATED if v is Verdict.ACCEPTED else v for v in report.verdicts)
+        gated = (Verdict.GATED if v.is_used else v for v in report.verdicts)
         return Report(tuple(gated), report.residuals, report.nis)
 
     def _update_late(self, measurement: RangeFrame | LandmarkFrame | PoseIncrement) -> Report:
         """Take a measurement at an instant that was passed, if the window reaches back to it."""
+        count = len(measurement.ranges) if isinstance(measurement, RangeFrame) else 1
+        too_late = Report((Verdict.LATE,) * count)
         node = None if self._stands else self._node_of(measurement.stamp_ns)
         if node is None:
-            count = len(measurement.ranges) if isinstance(measurement, RangeFrame) else 1
-            return Report((Verdict.LATE,) * count)
+            return too_late
         try:
             if isinstance(measurement, PoseIncrement):
                 return Report((self._update_late_increment(measurement, node),))
             return self._judge(measurement, *self._window.state_of(node))
         except GraphError:
-            return Report((Verdict.LATE,))
+            return too_late
 
     def _update_late_increment(self, measured: PoseIncrement, node: int) -> Verdict:
         verdict, reference = Verdict.ACCEPTED, self._node_of_keyframe(measured.from_stamp_ns)
@@ -222,6 +224,8 @@ class GraphSmoother(KeyframeTracker):
             cov = window.update(reference)
         except GraphError:
             self._begin_window(int(window.stamps_ns[-1]))
+            self._keyframes = {}
+            self._reference_stamp_ns = None
             return False
         mean = window.newest.ravel()
         if reference is None:
@@ -229,7 +233,7 @@ class GraphSmoother(KeyframeTracker):
             mean, cov = mean[pick], cov[np.ix_(pick, pick)]
         else:
             mean = np.concatenate([mean, window.graph.values[window.variable(reference)]])
-        self._resets += is_jump(self._mean[POSE], self._cov[POSE, POSE], mean[POSE])
+        self._reset_counter += is_jump(self._mean[POSE], self._cov[POSE, POSE], mean[POSE])
         self._mean, self._cov = mean, cov
         if self._stands:
             window.absorb()
@@ -248,8 +252,6 @@ class GraphSmoother(KeyframeTracker):
         self._window.begin(
             stamp_ns, self._mean[STATE].reshape(2, 3), self._cov[STATE, STATE] * np.outer(scale, scale)
         )
-        self._keyframes = {}
-        self._reference_stamp_ns = None
 
     def _predicted(self, stamp_ns: int) -> tuple[FloatArray, FloatArray]:
         """State (9,) and covariance (9, 9) at an instant near the newest node."""
@@ -262,6 +264,8 @@ class GraphSmoother(KeyframeTracker):
     def _node_of(self, stamp_ns: int) -> int | None:
         """The node of an instant, made if there is none yet; None when the window does not reach back."""
         window = self._window
+        if stamp_ns < window.stamps_ns[0]:
+            return None
         nearest = window.nearest(stamp_ns)
         if abs(int(window.stamps_ns[nearest]) - stamp_ns) < SAME_NS:
             return nearest

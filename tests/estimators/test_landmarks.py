@@ -11,7 +11,9 @@ from tests.estimators.matched_world import HALL, true_ranges
 from tests.estimators.particle_runs import errors_and_nees, matched_filter, seen_landmarks
 from tests.estimators.test_particle_filter import nees_bounds
 
-EVERY_FILTER = pytest.mark.parametrize("name", ["ekf", "pf", "pf_ibas", "pf_ibas_printed"])
+EVERY_FILTER = pytest.mark.parametrize(
+    "name", ["ekf", "graph", "pf", "pf_ibas", "pf_ibas_graph", "pf_ibas_printed"]
+)
 anything = st.floats(allow_nan=True, allow_infinity=True)
 
 

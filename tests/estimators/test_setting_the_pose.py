@@ -11,7 +11,7 @@ from tests.estimators.matched_world import HALL, true_increment, true_ranges
 SECOND_NS = 10**9
 POSE = np.array([3.0, 2.0, -3.1])
 COV = np.array([[0.04, 0.01, 0.0], [0.01, 0.03, 0.002], [0.0, 0.002, 0.02]])
-SETTABLE = ["ekf", "lidar_odometry", "pf", "pf_ibas", "pf_ibas_printed"]
+SETTABLE = ["ekf", "graph", "lidar_odometry", "pf", "pf_ibas", "pf_ibas_graph", "pf_ibas_printed"]
 EVERY_ONE = pytest.mark.parametrize("name", SETTABLE)
 
 
@@ -86,7 +86,7 @@ def test_what_is_older_than_that_moment_is_late_and_ranges_after_it_count(name: 
     assert report.verdicts == (expected,) * 4
 
 
-@pytest.mark.parametrize("name", ["ekf", "pf", "pf_ibas"])
+@pytest.mark.parametrize("name", ["ekf", "graph", "pf", "pf_ibas", "pf_ibas_graph"])
 def test_anchors_that_were_doubted_are_trusted_again(name: str) -> None:
     estimator = walked(name)
     far = HALL.start.pose + np.array([3.0, 0.0, 0.0])

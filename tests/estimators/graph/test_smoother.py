@@ -9,17 +9,18 @@ from scipy.stats import chi2
 
 from estimators.base import Estimator, Report, Verdict
 from estimators.ekf import Ekf
+from estimators.graph.judging import Belief, judge_ranges
 from estimators.graph.jumps import is_jump
 from estimators.graph.pf_ibas_graph import PfIbasGraph
 from estimators.graph.smoother import GraphSmoother
 from estimators.messages import FloatArray, LandmarkFrame, Measurement, PoseIncrement, RangeFrame
+from estimators.range_gate import RangeGate
 from tests.estimators.matched_world import (
-    ACCEL_NOISE,
     HALL,
     RANGE_SIGMA,
     STEP_NS,
-    YAW_ACCEL_NOISE,
     constant_velocity_truth,
+    matched_config,
     measured_walk,
     pose_error,
     random_truth,
@@ -28,14 +29,6 @@ from tests.estimators.matched_world import (
 from tests.strategies import range_frame
 
 Taken = RangeFrame | PoseIncrement
-NOISE: dict[str, float] = {
-    "range_sigma": RANGE_SIGMA,
-    "range_gate": 1 - 1e-9,
-    "suspect_for": 0.0,
-    "increment_gate": 1 - 1e-9,
-    "accel_noise": ACCEL_NOISE,
-    "yaw_accel_noise": YAW_ACCEL_NOISE,
-}
 KINDS: dict[str, type[GraphSmoother]] = {"graph": GraphSmoother, "pf_ibas_graph": PfIbasGraph}
 EVERY_KIND = pytest.mark.parametrize("kind", KINDS)
 TIGHT = np.diag([1e-6, 1e-6, 1e-7])
@@ -43,15 +36,15 @@ NOW_NS = 10**9
 
 
 def matched(kind: str, lag: float) -> GraphSmoother:
-    """Estimator with the world's own noise."""
+    """Estimator with the world's own noise, nothing blocked."""
     cls = KINDS[kind]
-    return cls(cls.Config(**NOISE, lag=lag), HALL)
+    return cls(cls.Config.model_validate({**matched_config().model_dump(), "lag": lag}), HALL)
 
 
-def plain(kind: str) -> GraphSmoother:
-    """Estimator with its defaults."""
+def plain(kind: str, **settings: object) -> GraphSmoother:
+    """Estimator with its defaults, but for these settings."""
     cls = KINDS[kind]
-    return cls(cls.Config(), HALL)
+    return cls(cls.Config.model_validate(settings), HALL)
 
 
 def taken(steps: Sequence[tuple[int, list[Taken]]]) -> list[Taken]:
@@ -95,12 +88,27 @@ def test_where_all_is_nearly_linear_it_agrees_with_the_kalman_filter() -> None:
     rng = np.random.default_rng(3)
     truth = random_truth(rng, 2.0)
     measurements = taken(measured_walk(truth, rng))
-    ekf, graph = Ekf(Ekf.Config(**NOISE), HALL), matched("graph", 5.0)
+    ekf, graph = Ekf(matched_config(), HALL), matched("graph", 5.0)
     for a, b in zip(run(ekf, measurements), run(graph, measurements), strict=True):
         assert a.verdicts == b.verdicts
     sigma = np.sqrt(np.diag(ekf.state[1]))
     assert (np.abs(pose_error(ekf.state[0], graph.state[0])) < 0.3 * sigma[:3]).all()
     np.testing.assert_allclose(np.diag(graph.state[1]), sigma**2, rtol=0.1)
+
+
+def test_a_range_that_is_weighed_down_becomes_a_factor_with_a_larger_sigma() -> None:
+    gate = RangeGate(RangeGate.Config(range_sigma=RANGE_SIGMA, nlos=("robust",)), HALL)
+    frame = true_ranges(0, HALL.start.pose, HALL)
+    frame.ranges[1] += 0.5
+    belief = Belief(HALL.start.pose.copy(), 1e-4 * np.eye(3))
+    numbers = {anchor_id: i for i, anchor_id in enumerate(HALL.anchors)}
+    report, rows = judge_ranges(gate, frame, belief, HALL.tag_in_body, numbers)
+    good = Verdict.ACCEPTED
+    assert report.verdicts == (good, Verdict.DOWNWEIGHTED, good, good)
+    np.testing.assert_array_equal(rows[:, 1], range(4))
+    assert rows[1, 3] > 5.0 * RANGE_SIGMA
+    assert (rows[[0, 2, 3], 3] < 1.1 * RANGE_SIGMA).all()
+    np.testing.assert_allclose(belief.mean, HALL.start.pose, atol=2e-3)
 
 
 @EVERY_KIND
@@ -205,7 +213,16 @@ def test_ranges_that_the_filter_refuses_do_not_move_the_graph(kind: str) -> None
         run(estimator, [true_ranges(k * 10**8, HALL.start.pose, HALL) for k in range(11)])
     frame = true_ranges(NOW_NS + 1, HALL.start.pose, HALL)
     report = disturbed.update(range_frame(NOW_NS + 1, [11], [float(frame.ranges[1]) + 2.0]))
-    assert report.verdicts == (Verdict.GATED,)
+    assert report.verdicts == (Verdict.TOO_LONG,)
+    np.testing.assert_array_equal(disturbed.state[0], undisturbed.state[0])
+
+
+def test_ranges_that_the_particle_filter_weighs_down_do_not_move_the_graph() -> None:
+    disturbed, undisturbed = (plain("pf_ibas_graph", nlos=("robust",)) for _ in range(2))
+    frame = true_ranges(0, HALL.start.pose, HALL)
+    report = disturbed.update(range_frame(0, [11], [float(frame.ranges[1]) + 1.0]))
+    assert report.verdicts == (Verdict.DOWNWEIGHTED,)
+    undisturbed.update(range_frame(0, [], []))
     np.testing.assert_array_equal(disturbed.state[0], undisturbed.state[0])
 
 
