@@ -178,7 +178,7 @@ def test_what_is_no_range_says_what_is_wrong() -> None:
     assert gate("prediction").candidates(bad, POSE) == [wrong, wrong, wrong, Verdict.UNKNOWN_ANCHOR]
 
 
-FILTERS = ["ekf", "pf", "pf_ibas"]
+FILTERS = ["ekf", "graph", "pf", "pf_ibas", "pf_ibas_graph"]
 
 
 def stand(

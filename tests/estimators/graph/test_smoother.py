@@ -9,6 +9,8 @@ from scipy.stats import chi2
 
 from estimators.base import Estimator, Report, Verdict
 from estimators.ekf import Ekf
+from estimators.graph.errors import GraphError
+from estimators.graph.fixed_lag import FixedLag
 from estimators.graph.judging import Belief, judge_ranges
 from estimators.graph.jumps import is_jump
 from estimators.graph.pf_ibas_graph import PfIbasGraph
@@ -153,6 +155,29 @@ def test_late_outliers_are_gated_and_strays_refused() -> None:
     assert smoother.update(bad).verdicts == (Verdict.IMPOSSIBLE,)
     assert smoother.update(true_ranges(0, truth[0, :3], HALL)).verdicts == (Verdict.LATE,) * 4
     np.testing.assert_array_equal(smoother.state[0], before)
+
+
+def test_late_ranges_get_a_verdict_each_when_the_window_cannot_be_solved(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def fail(*_: object) -> None:
+        raise GraphError("not determined")
+
+    smoother = matched("graph", 1.0)
+    run(smoother, [true_ranges(k * 10**8, HALL.start.pose, HALL) for k in range(5)])
+    monkeypatch.setattr(FixedLag, "state_of", fail)
+    late = true_ranges(3 * 10**8, HALL.start.pose, HALL)
+    assert smoother.update(late).verdicts == (Verdict.LATE,) * 4
+
+
+def test_a_pose_that_is_set_counts_on_from_the_jumps() -> None:
+    smoother = plain("graph", range_gate=1 - 1e-12)
+    there = HALL.start.pose + np.array([1.2, 0.0, 0.0])
+    smoother.update(true_ranges(0, there, HALL))
+    smoother.start_at(NOW_NS, there, TIGHT)
+    pose = smoother.pose_at(NOW_NS)
+    assert pose is not None
+    assert pose.reset_counter == 2
 
 
 def test_a_keyframe_of_a_robot_that_stands_is_found_when_it_sets_off() -> None:

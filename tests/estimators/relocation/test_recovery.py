@@ -22,7 +22,7 @@ from tests.estimators.relocation.wandering_robot import (
 )
 from tests.strategies import SETUP, hostile_streams, range_frame
 
-FILTERS = ["ekf", "pf", "pf_ibas"]
+FILTERS = ["ekf", "graph", "pf", "pf_ibas", "pf_ibas_graph"]
 
 
 def recovering(name: str, setup: Setup, **settings: float) -> Estimator:
