@@ -5,12 +5,14 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from estimators.base import Setup, Start
+from estimators import estimator_config_class, make_estimator
+from estimators.base import Setup, Start, Verdict
 from estimators.geometry import compose, lift
 from estimators.lidar.occupancy_grid import OccupancyGrid
 from estimators.messages import FloatArray, PoseEstimate, PoseIncrement, Scan
 from estimators.nlos.visibility import OBSTRUCTED, PERIOD_NS, Visibility
 from tests.estimators.lidar.room_scans import PERIOD, ROOM, Arc, Loop, scan_while_moving
+from tests.strategies import range_frame
 
 MOUNTING = np.array([0.1, -0.05, 0.7])
 TAG = np.array([-0.1, 0.0, 0.2])
@@ -151,6 +153,23 @@ def test_a_scan_is_added_only_with_its_own_increment_and_not_too_often(
     assert not added
     shown(STANDING, seconds=4.0)
     assert len(added) == pytest.approx(4e9 / PERIOD_NS, abs=4)
+
+
+@pytest.mark.parametrize("name", ["ekf", "graph", "pf", "pf_ibas", "pf_ibas_graph"])
+def test_every_filter_sees_the_obstacle_in_its_scans(name: str) -> None:
+    config = estimator_config_class(name).model_validate({"nlos": ["visibility"]})
+    estimator = make_estimator(name, config, SETUP)
+    starts = np.arange(0.0, 1.0, PERIOD).tolist()
+    scans = [scan_while_moving(ROOM, STANDING, start, lidar_in_body=MOUNTING) for start in starts]
+    first_ns, last_ns = scans[0].end_stamp_ns, scans[-1].end_stamp_ns
+    for scan in scans:
+        estimator.update(scan)
+        stamp_ns, tight = scan.end_stamp_ns, 1e-6 * np.eye(3)
+        estimator.update(PoseIncrement(first_ns, stamp_ns, np.zeros(3), tight, stamp_ns == first_ns))
+    tag = lift(POSE, HEIGHT) @ np.append(TAG, 1.0)
+    slants = [float(np.linalg.norm(anchor - tag[:3])) for anchor in (HIDDEN, FREE)]
+    report = estimator.update(range_frame(last_ns, [0, 1], slants))
+    assert report.verdicts == (Verdict.OBSTRUCTED, Verdict.ACCEPTED)
 
 
 def test_scans_with_anything_in_them_do_no_harm() -> None:
