@@ -9,8 +9,8 @@ from estimators.base import Estimator, Settable, Setup
 
 ESTIMATORS: dict[str, tuple[str, str]] = {
     "ekf": ("estimators.ekf", "Ekf"),
-    "least_squares": ("estimators.least_squares", "LeastSquares"),
     "graph": ("estimators.graph.smoother", "GraphSmoother"),
+    "least_squares": ("estimators.least_squares", "LeastSquares"),
     "lidar_odometry": ("estimators.lidar.odometry", "LidarOdometry"),
     "pf": ("estimators.particle_filter", "ParticleFilter"),
     "pf_ibas": ("estimators.pf_ibas", "PfIbas"),

@@ -113,7 +113,7 @@ BAD_INPUT = {
     "no MCAP": (["replay", "text.mcap"], "text.mcap is not an MCAP file"),
     "unknown estimator": (
         ["replay", "LOG", "--estimator", "magic"],
-        "--estimator: unknown estimator 'magic', there are: ekf, least_squares, lidar_odometry",
+        "--estimator: unknown estimator 'magic', there are: ekf, graph, least_squares, lidar_odometry",
     ),
     "wrong set": (["replay", "LOG", "--set", "pipeline.rate=999"], "pipeline.rate: Input should be less"),
     "missing site": (["run", "--site", "gone.toml"], "cannot read gone.toml: No such file or directory"),
