@@ -57,8 +57,8 @@ app = typer.Typer(
 app.add_typer(doctor, name="doctor")
 app.add_typer(evaluate_app, name="evaluate", cls=_ScenarioUnlessNamed)
 app.command()(smooth)
-out = Console()
-err = Console(stderr=True, highlight=False)
+out = Console(emoji=False)
+err = Console(stderr=True, highlight=False, emoji=False)
 
 Scenario_ = Annotated[
     str, typer.Argument(metavar="SCENARIO", help="Scenario file, or the name of one in params/scenarios.")

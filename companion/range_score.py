@@ -16,6 +16,8 @@ _JUDGED = frozenset(Verdict) - {
     Verdict.IMPOSSIBLE,
     Verdict.TOO_FEW,
     Verdict.LATE,
+    Verdict.WAITING,
+    Verdict.AMBIGUOUS,
     Verdict.NOT_USED,
 }
 
