@@ -39,7 +39,8 @@ class Recovering:
 
     Before the start is known there is no pose. A known filter is only disturbed when the last seconds' ranges
     agree, most of them and along the whole way, on one other pose, clearly not on its own, and some are too
-    short for its own: blocked anchors only lengthen ranges, so they do not move a filter that is right.
+    short for its own: blocked anchors only lengthen ranges, so they do not move a filter that is right. That
+    last proof is not asked for while a found pose is younger than the window: it came of less of a way.
 
     Args:
         wrapped: the filter.
@@ -88,6 +89,7 @@ class Recovering:
         self._known = self._starts_known
         self._note = "" if self._known else self._doubt(None)
         self._searched_ns: int | None = None
+        self._set_ns: int | None = None
 
     def update(self, measurement: Measurement) -> Report:
         """Take one measurement; while the pose is looked for, the report's note says what is missing."""
@@ -135,7 +137,14 @@ class Recovering:
             note = note or flaw
             if found is None:
                 continue
-            if estimate is None or held is None or _rules_out(found, placed, held, estimate.planar_cov):
+            if (
+                estimate is None
+                or held is None
+                or (
+                    _is_better(found, placed, held, estimate.planar_cov)
+                    and (self._is_young(estimate.stamp_ns) or too_short(placed, held) > MOST_TOO_SHORT)
+                )
+            ):
                 self._set(found)
                 return ""
         if estimate is not None:
@@ -176,21 +185,22 @@ class Recovering:
         for increment in self._window.since_keyframe:
             self._wrapped.update(increment)
         self._known = True
+        self._set_ns = self._window.keyframe_ns
+
+    def _is_young(self, now_ns: int) -> bool:
+        """Whether the filter's pose was found less than a window ago."""
+        return self._set_ns is not None and (now_ns - self._set_ns) * 1e-9 < self._config.window
 
 
 def _is_clearly_less(loss: float, other: float) -> bool:
     return other > CLEARLY_LESS * loss + CLEARLY_BELOW
 
 
-def _rules_out(found: Minimum, placed: PlacedRanges, held: FloatArray, cov: FloatArray) -> bool:
-    """Whether a filter that holds this pose (3,) with this covariance (3, 3) must be wrong.
+def _is_better(found: Minimum, placed: PlacedRanges, held: FloatArray, cov: FloatArray) -> bool:
+    """Whether ranges speak clearly for what was found and against a filter's pose (3,), covariance (3, 3).
 
     Two anchors of four that are blocked alike fit a wrong place with a third one better than the right place
     without. But at the right place no range is too short.
     """
     loss = float(total_loss(placed, held[None])[0])
-    return (
-        too_short(placed, held) > MOST_TOO_SHORT
-        and _is_clearly_less(found.loss, loss)
-        and lies_outside(found.pose, held, found.cov + cov, OUTSIDE)
-    )
+    return _is_clearly_less(found.loss, loss) and lies_outside(found.pose, held, found.cov + cov, OUTSIDE)

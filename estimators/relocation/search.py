@@ -112,13 +112,15 @@ def find_pose(placed: PlacedRanges, bias_sigma: float) -> Minimum | None:
     if cov is None:
         return None
     agreeing = np.abs(residuals[0]) < SHORT_LIMIT
+    mean_square = float((residuals[0, agreeing] ** 2).mean()) if agreeing.any() else np.inf
     return Minimum(
         pose=pose,
-        cov=cov,
+        # Ranges that agree less well than their noise allows hold the pose less well, too.
+        cov=cov * max(1.0, mean_square),
         loss=float(losses[best]),
         agreeing=float(agreeing.mean()),
         least_agreeing=min(float(third.mean()) for third in np.array_split(agreeing, 3)),
-        mean_square=float((residuals[0, agreeing] ** 2).mean()) if agreeing.any() else np.inf,
+        mean_square=mean_square,
         rival=float(others.min()) if len(others) else np.inf,
     )
 
