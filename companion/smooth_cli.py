@@ -2,7 +2,7 @@
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import typer
@@ -13,7 +13,9 @@ from rich.table import Table
 from companion.config import load_config
 from companion.errors import UserError
 from companion.log import Log
-from companion.smooth import SMOOTHED, SmoothedLog, anchors_toml, smooth_log
+
+if TYPE_CHECKING:
+    from companion.smooth import SmoothedLog
 
 
 def smooth(
@@ -41,6 +43,9 @@ def smooth(
     """
     from companion.plots import figure
     from companion.replay import config_of, tum_line
+
+    # Numba loads slowly: only who smooths waits for it.
+    from companion.smooth import SMOOTHED, anchors_toml, smooth_log
     from companion.tables import accuracy_table
 
     out, err = Console(), Console(stderr=True, highlight=False)
@@ -83,7 +88,7 @@ def smooth(
     out.print(f"  written to {folder}: {', '.join([*files, 'smooth.png'])}", highlight=False, soft_wrap=True)
 
 
-def _anchor_table(found: SmoothedLog, anchors: bool, biases: bool) -> Table:
+def _anchor_table(found: "SmoothedLog", anchors: bool, biases: bool) -> Table:
     table = Table(title="anchors, and what is left of their ranges", title_justify="left")
     headings = ["anchor"]
     headings += ["x\nm", "y\nm", "sigma\nm", "moved\nm"] if anchors else []
@@ -104,7 +109,7 @@ def _anchor_table(found: SmoothedLog, anchors: bool, biases: bool) -> Table:
     return table
 
 
-def _summary(found: SmoothedLog) -> dict[str, object]:
+def _summary(found: "SmoothedLog") -> dict[str, object]:
     accuracies = {name: found.replay.accuracy(name) for name in found.replay.names}
     return {
         "rmse_m": {name: accuracy.rmse for name, accuracy in accuracies.items() if accuracy is not None},
