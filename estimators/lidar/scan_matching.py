@@ -28,26 +28,32 @@ HELD_RATIO = 5.0
 """Walls hold a direction when a scan says so many times more of it than noise of the normals feigns."""
 LEAST_INFORMATION = 1.0
 """Information [1/m^2, 1/rad^2] that every direction has: what nothing observes comes out with sigma 1."""
+KEYFRAME_SHARE = 0.7
+"""When a smaller share of the surface points is matched, too little of the keyframe is still in view."""
 LEAST_MATCHED = 10
 """With fewer matched points there is no match."""
 CONVERGED = 1e-4
 """A step of the pose that is smaller [m, rad] is the last."""
 MOST_ITERATIONS = 20
 
-_FIXED = 1e-9
-"""Variance of the pose at the keyframe [m^2, rad^2]: zero, but no singular covariance."""
+_LEAST_VARIANCE = 1e-9
+"""Of a pose [m^2, rad^2], so that no covariance is singular."""
 _NEWEST = np.arange(6, 9)
 _OTHERS = np.delete(np.arange(12), _NEWEST)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Match:
-    """A scan in place: both states (12,), covariance of the newer (6, 6), increment and its covariance."""
+    """A scan in place: both states (12,), covariance of the newer (6, 6), increment and its covariance.
+
+    The share is that of the surface points that are matched.
+    """
 
     states: FloatArray
     cov: FloatArray
     increment: FloatArray
     increment_cov: FloatArray
+    share: float
 
 
 class ScanMatcher:
@@ -115,10 +121,12 @@ class ScanMatcher:
 
         self._line_map = line_map
         self._config = config
+        self._T_body_lidar = T_body_lidar
         self._preparation = ScanPreparation(preparation or ScanPreparation.Config(), T_body_lidar)
         self._keyframe: LineMap | None = None
         self._keyframe_ns = 0
         self._keyframe_is_blind = False
+        self._keyframe_cov = np.zeros((3, 3))
         self._stamp_ns = 0
         self._state = np.zeros(6)
         self._cov = np.zeros((6, 6))
@@ -153,10 +161,9 @@ class ScanMatcher:
 
         self._stamp_ns, self._state, self._cov = stamp_ns, match.states[6:], match.cov
         # A keyframe that was taken without knowing the speed is distorted, so it is left at once.
-        is_keyframe = self._keyframe_is_blind or self._moved_far()
-        increment = PoseIncrement(
-            self._keyframe_ns, stamp_ns, match.increment, match.increment_cov, is_keyframe
-        )
+        is_keyframe = self._keyframe_is_blind or self._moved_far() or match.share < KEYFRAME_SHARE
+        cov = match.increment_cov + self._keyframe_cov
+        increment = PoseIncrement(self._keyframe_ns, stamp_ns, match.increment, cov, is_keyframe)
         if is_keyframe:
             self._found_keyframe(is_blind=False)
         return increment
@@ -164,21 +171,28 @@ class ScanMatcher:
     def _begin(self, scan: PreparedScan) -> PoseIncrement:
         """Found a keyframe where nothing is known of the motion."""
         self._stamp_ns, self.points = scan.stamp_ns, scan.points
-        self._state, self._cov = np.zeros(6), UNKNOWN_SPEED_SIGMA**2 * np.eye(6)
+        self._state = np.zeros(6)
+        # The points are displaced by up to half of the way during the scan, which is not known.
+        displaced = -0.5 * UNKNOWN_SPEED_SIGMA * float(scan.times[0])
+        self._cov = np.diag([displaced**2 + _LEAST_VARIANCE] * 3 + [UNKNOWN_SPEED_SIGMA**2] * 3)
         self._found_keyframe(is_blind=True)
         return PoseIncrement(scan.stamp_ns, scan.stamp_ns, np.zeros(3), np.zeros((3, 3)), is_keyframe=True)
 
     def _found_keyframe(self, *, is_blind: bool) -> None:
-        """The newest scan is the new keyframe, its pose the new origin."""
+        """The newest scan is the new keyframe, its pose the new origin.
+
+        The state is from now on that against the points of the keyframe. Where among them the body was at the
+        end of the scan is as uncertain as before: the last beams alone tell, and the velocity.
+        """
         config = self._config
         self._keyframe = self._line_map.LineMap(self.points, config.range_sigma, config.max_correspondence)
         self._keyframe_ns, self._keyframe_is_blind = self._stamp_ns, is_blind
-        turn = np.eye(3)
-        turn[:2, :2] = rotation(-self._state[2])
-        velocity_cov = turn @ self._cov[3:, 3:] @ turn.T
-        self._state = np.concatenate([np.zeros(3), turn @ self._state[3:]])
-        self._cov = _FIXED * np.eye(6)
-        self._cov[3:, 3:] = velocity_cov
+        turn = np.eye(6)
+        turn[:2, :2] = turn[3:5, 3:5] = rotation(-self._state[2])
+        self._state = turn @ self._state
+        self._state[:3] = 0.0
+        self._cov = turn @ self._cov @ turn.T
+        self._keyframe_cov = self._cov[:3, :3]
 
     def _moved_far(self) -> bool:
         return bool(
@@ -193,6 +207,14 @@ class ScanMatcher:
         every_basis = cubic_between(1.0 + scan.times / dt, dt)
         found = self._line_map.surface(scan.points, sigma)
         points, normals, basis = scan.points[found.own], found.normals, every_basis[found.own]
+        if len(points) < LEAST_MATCHED:
+            return None
+
+        # A range errs along its beam, a distance from a wall by the part of that which is square to it.
+        beams = points - self._T_body_lidar[:2]
+        least_variance = sigma**2 * float(
+            ((beams * normals).sum(axis=1) ** 2 / (beams**2).sum(axis=1)).mean()
+        )
 
         F, Q = smooth_motion(dt, config.accel_noise, config.yaw_accel_noise, config.bandwidth)
         motion = np.hstack([-F, np.eye(6)])
@@ -213,27 +235,31 @@ class ScanMatcher:
             held = _held(sums.pose_hessian, sums.feigned)
             of_all = np.kron(np.eye(4), held)
             # Half of the squares is noise of the keyframe, which does not average out from scan to scan.
-            variance = max(sigma**2, 0.5 * sums.squares / sums.weight)
-            posterior = prior + of_all @ sums.hessian @ of_all.T / variance
+            variance = max(least_variance, 0.5 * sums.squares / sums.weight)
+            posterior = prior + of_all @ sums.hessian @ of_all / variance
             gradient = of_all @ sums.gradient / variance + prior @ (states - predicted)
             # What nothing holds goes on as predicted; else the least doubt of its direction would move it.
-            step = of_all.T @ np.linalg.solve(posterior, -gradient)
+            step = of_all @ np.linalg.solve(posterior, -gradient)
             states = states + step
             if float(np.abs(step[_NEWEST]).max()) < CONVERGED:
                 break
-        if len(distances) < config.min_inlier_share * len(points):
+        share = len(distances) / len(points)
+        wandered = config.accel_noise * np.sqrt(dt**3 / 3.0)
+        # A bare wall looks the same everywhere: after a long gap it is only known to be one when all fits.
+        is_another = wandered > config.max_correspondence and np.linalg.matrix_rank(held, tol=0.5) < 3
+        if share < config.min_inlier_share or is_another:
             return None
 
         poses = every_basis @ states.reshape(4, 3)
         in_keyframe = transform_each(poses, scan.points)
         self.points = transform(inverse(states[_NEWEST]), in_keyframe)
         increment, cov = _said_by_scan(prior, posterior, states, predicted, held)
-        gain = np.linalg.pinv(held @ sums.pose_hessian @ held.T, rcond=1e-9, hermitian=True) @ held
+        gain = np.linalg.pinv(held @ sums.pose_hessian @ held, rcond=1e-9, hermitian=True)
         keyframe_cov = variance * gain @ keyframe.gradient_noise(sums.by_line) @ gain.T
         velocity = states[9:]
         cov += keyframe_cov + (1e-3 * config.stamp_sigma_ms) ** 2 * np.outer(velocity, velocity)
         cov_of_states = np.linalg.inv(posterior)[6:, 6:]
-        return _Match(states, 0.5 * (cov_of_states + cov_of_states.T), increment, 0.5 * (cov + cov.T))
+        return _Match(states, 0.5 * (cov_of_states + cov_of_states.T), increment, 0.5 * (cov + cov.T), share)
 
 
 def _said_by_scan(
@@ -252,7 +278,7 @@ def _said_by_scan(
 
 
 def _held(pose_hessian: FloatArray, feigned: FloatArray) -> FloatArray:
-    """Matrix (3, 3) that takes out of a derivative by the pose what no wall holds.
+    """Projection (3, 3) of a change of the pose [m, rad] on what walls hold.
 
     Along a bare corridor the information is not zero: normals are noisy, so every line seems to hold a
     little. How much that is on average is known; a direction with hardly more than that is held by nothing.
@@ -263,8 +289,8 @@ def _held(pose_hessian: FloatArray, feigned: FloatArray) -> FloatArray:
     root = np.linalg.cholesky(feigned + 1e-9 * np.trace(feigned) * np.eye(3))
     half = np.linalg.solve(root, pose_hessian)
     values, vectors = np.linalg.eigh(np.linalg.solve(root, half.T))
-    kept = vectors[:, values > HELD_RATIO]
-    held: FloatArray = root @ kept @ kept.T @ np.linalg.inv(root)
+    free, _ = np.linalg.qr(np.linalg.solve(root.T, vectors[:, values <= HELD_RATIO]))
+    held: FloatArray = np.eye(3) - free @ free.T
     return held
 
 
