@@ -29,6 +29,15 @@ def crossing(position: float, direction: float) -> tuple[int, float, float]:
     return 0, inf, inf
 
 
+@inlined
+def within(position: float, direction: float, cells: int) -> tuple[float, float]:
+    """Shares of a line's length between which it is inside the grid, along one axis."""
+    if direction == 0.0:
+        return (0.0, 1.0) if 0.0 <= position < cells else (1.0, 0.0)
+    low, high = -position / direction, (cells - position) / direction
+    return max(min(low, high), 0.0), min(max(low, high), 1.0)
+
+
 @compiled(f"void({CELLS}, int32[:, ::1], int32, float64, float64, {MATRIX}, float32, float32, float32)")
 def trace_scan(
     log_odds: CellArray,
@@ -95,6 +104,14 @@ def is_blocked(log_odds: CellArray, x: float, y: float, end_x: float, end_y: flo
     Source: Amanatides and Woo, A fast voxel traversal algorithm for ray tracing, Eurographics 1987.
     """
     rows, columns = log_odds.shape
+    first_x, last_x = within(x, end_x - x, columns)
+    first_y, last_y = within(y, end_y - y, rows)
+    first, last = max(first_x, first_y), min(last_x, last_y)
+    if not first <= last:
+        return False
+    dx, dy = end_x - x, end_y - y
+    end_x, end_y = x + last * dx, y + last * dy
+    x, y = x + first * dx, y + first * dy
     column, row = floor(x), floor(y)
     end_column, end_row = floor(end_x), floor(end_y)
     step_x, next_x, gap_x = crossing(x, end_x - x)

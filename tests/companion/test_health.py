@@ -117,11 +117,12 @@ def test_a_range_that_is_too_short_is_an_alarm_where_a_long_one_is_none(
 def test_a_lost_pose_must_agree_better_than_one_that_is_kept() -> None:
     # Two of five: enough to go on, not enough to begin.
     verdicts = (*(Verdict.ACCEPTED,) * 2, *(Verdict.GATED,) * 3)
+    ones = np.ones(5)
     kept, lost = monitor_at(5.0), monitor_at(5.0)
     go_on(lost, 5, 15, Verdict.GATED)
     for monitor, begin in ((kept, 5), (lost, 15)):
         for stamp_ns in range(begin * SECOND, (begin + 20) * SECOND, SECOND // 10):
-            monitor.observe(ranges(stamp_ns), Report(verdicts))
+            monitor.observe(RangeFrame(stamp_ns, 1, np.arange(5), ones, ones, ones), Report(verdicts))
             monitor.observe(increment(stamp_ns), Report((Verdict.ACCEPTED,)))
     assert state(kept, 25.0, pose()) is State.OK
     assert state(lost, 35.0, pose()) is State.LOST

@@ -80,6 +80,15 @@ def test_nothing_is_known_of_what_was_not_seen() -> None:
     assert cell_at(room_grid(), inside_box) == 0.0
 
 
+def test_a_line_from_far_outside_is_followed_where_there_is_a_grid_only() -> None:
+    grid = room_grid()
+    along, y = np.array([1e9, 0.0]), np.array([0.0, 3.1])
+    assert grid.blocked(y - along, y + along)
+    assert grid.blocked(y + along, y - along)
+    assert not grid.blocked(y + 100.0 - along, y + 100.0 + along)
+    assert not grid.blocked(y - along, y - 0.5 * along)
+
+
 def test_what_went_away_is_forgotten() -> None:
     grid = room_grid(scans=50)
     behind = np.array([5.8, 4.0])
