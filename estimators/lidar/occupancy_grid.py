@@ -60,8 +60,7 @@ class OccupancyGrid:
     @property
     def origin(self) -> FloatArray:
         """Corner (2,) [m] of cell ``[0, 0]`` with the least x and y, map frame."""
-        origin: FloatArray = self._corner * self._cell
-        return origin
+        return self._corner.astype(np.float64) * self._cell
 
     @property
     def log_odds(self) -> NDArray[np.float32]:
