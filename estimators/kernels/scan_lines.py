@@ -274,3 +274,26 @@ def normal_equations(
                 for b in range(3):
                     hessian[3 * p + a, 3 * q + b] = blocks[p, q, max(a, b), min(a, b)]
     return hessian, gradient, pose, feigned, by_line, total, squares
+
+
+@compiled(f"{MATRIX}({MATRIX}, int64[:, ::1], int64)")
+def noise_of_points(by_line: FloatArray, spans: IntegerArray, count: int) -> FloatArray:
+    """Covariance (3, 3) of a sum over lines when the points that the lines go through have noise of variance 1.
+
+    Args:
+        by_line: (M, 3) change of the sum with the offset of each line.
+        spans: (M, 2) first and last point of each line.
+        count: number of points.
+    """
+    change, noise, share = np.zeros((count + 1, 3)), np.zeros((3, 3)), np.zeros(3)
+    for k in range(len(by_line)):
+        for a in range(3):
+            part = by_line[k, a] / (spans[k, 1] - spans[k, 0] + 1)
+            change[spans[k, 0], a] += part
+            change[spans[k, 1] + 1, a] -= part
+    for i in range(count):
+        share += change[i]
+        for a in range(3):
+            for b in range(3):
+                noise[a, b] += share[a] * share[b]
+    return noise

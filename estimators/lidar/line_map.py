@@ -4,7 +4,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from estimators.kernels.scan_lines import associate, fit_lines, normal_equations, sort_into_cells
+from estimators.kernels.scan_lines import (
+    associate,
+    fit_lines,
+    noise_of_points,
+    normal_equations,
+    sort_into_cells,
+)
 from estimators.messages import FloatArray, IntArray
 
 LINE_REACH = 10.0
@@ -115,10 +121,4 @@ class LineMap:
 
         Lines share their points with their neighbours, and many points may be matched to one line.
         """
-        share = by_line / (self._spans[:, 1] - self._spans[:, 0] + 1)[:, None]
-        change = np.zeros((self._points + 1, 3))
-        np.add.at(change, self._spans[:, 0], share)
-        np.subtract.at(change, self._spans[:, 1] + 1, share)
-        by_point = np.cumsum(change, axis=0)
-        noise: FloatArray = by_point.T @ by_point
-        return noise
+        return noise_of_points(by_line, self._spans, self._points)

@@ -233,7 +233,9 @@ class ScanMatcher:
             scale = max(2.0 * sigma, 1.5 * float(np.partition(distances, middle)[middle]))
             sums = keyframe.sums(basis, rows, index, scale)
             held = _held(sums.pose_hessian, sums.feigned)
-            of_all = np.kron(np.eye(4), held)
+            of_all = np.zeros((12, 12))
+            for k in range(0, 12, 3):
+                of_all[k : k + 3, k : k + 3] = held
             # Half of the squares is noise of the keyframe, which does not average out from scan to scan.
             variance = max(least_variance, 0.5 * sums.squares / sums.weight)
             posterior = prior + of_all @ sums.hessian @ of_all / variance
@@ -289,6 +291,8 @@ def _held(pose_hessian: FloatArray, feigned: FloatArray) -> FloatArray:
     root = np.linalg.cholesky(feigned + 1e-9 * np.trace(feigned) * np.eye(3))
     half = np.linalg.solve(root, pose_hessian)
     values, vectors = np.linalg.eigh(np.linalg.solve(root, half.T))
+    if values[0] > HELD_RATIO:
+        return np.eye(3)
     free, _ = np.linalg.qr(np.linalg.solve(root.T, vectors[:, values <= HELD_RATIO]))
     held: FloatArray = np.eye(3) - free @ free.T
     return held
