@@ -278,7 +278,7 @@ def normal_equations(
 
 @compiled(f"{MATRIX}({MATRIX}, int64[:, ::1], int64)")
 def noise_of_points(by_line: FloatArray, spans: IntegerArray, count: int) -> FloatArray:
-    """Covariance (3, 3) of a sum over lines when the points that the lines go through have noise of variance 1.
+    """Covariance (3, 3) of a sum over lines from noise of variance 1 of the points that lines go through.
 
     Args:
         by_line: (M, 3) change of the sum with the offset of each line.

@@ -25,11 +25,13 @@ class Surface:
         lines: (M, 6) as `fit_lines` gives them.
         spans: (M, 2) first and last point of each line.
         own: (M,) which point each line belongs to.
+        points: (M, 2) these points [m].
     """
 
     lines: FloatArray
     spans: IntArray
     own: IntArray
+    points: FloatArray
 
     @property
     def normals(self) -> FloatArray:
@@ -39,7 +41,8 @@ class Surface:
 
 def surface(points: FloatArray, range_sigma: float) -> Surface:
     """Lines through points (N, 2) [m] in the order of the beams, whose ranges have this noise [m]."""
-    return Surface(*fit_lines(points, LINE_REACH * range_sigma, range_sigma))
+    lines, spans, own = fit_lines(points, LINE_REACH * range_sigma, range_sigma)
+    return Surface(lines, spans, own, points[own])
 
 
 @dataclass(frozen=True, slots=True, eq=False)

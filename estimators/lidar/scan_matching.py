@@ -126,12 +126,13 @@ class ScanMatcher:
         self._keyframe: LineMap | None = None
         self._keyframe_ns = 0
         self._keyframe_is_blind = False
-        self._keyframe_cov = np.zeros((3, 3))
         self._stamp_ns = 0
         self._state = np.zeros(6)
         self._cov = np.zeros((6, 6))
         self.points = np.empty((0, 2))
         """(N, 2) [m] of the newest scan, as seen from where the body is at its end."""
+        self.points_cov = np.zeros((3, 3))
+        """(3, 3) where among the points of the newest keyframe the body was: x, y [m], yaw [rad]."""
         self.refused = 0
         """Scans that could not be matched, so that odometry began anew."""
 
@@ -162,7 +163,7 @@ class ScanMatcher:
         self._stamp_ns, self._state, self._cov = stamp_ns, match.states[6:], match.cov
         # A keyframe that was taken without knowing the speed is distorted, so it is left at once.
         is_keyframe = self._keyframe_is_blind or self._moved_far() or match.share < KEYFRAME_SHARE
-        cov = match.increment_cov + self._keyframe_cov
+        cov = match.increment_cov + self.points_cov
         increment = PoseIncrement(self._keyframe_ns, stamp_ns, match.increment, cov, is_keyframe)
         if is_keyframe:
             self._found_keyframe(is_blind=False)
@@ -192,7 +193,7 @@ class ScanMatcher:
         self._state = turn @ self._state
         self._state[:3] = 0.0
         self._cov = turn @ self._cov @ turn.T
-        self._keyframe_cov = self._cov[:3, :3]
+        self.points_cov = self._cov[:3, :3]
 
     def _moved_far(self) -> bool:
         return bool(
@@ -206,7 +207,7 @@ class ScanMatcher:
         dt = (scan.stamp_ns - self._stamp_ns) * 1e-9
         every_basis = cubic_between(1.0 + scan.times / dt, dt)
         found = self._line_map.surface(scan.points, sigma)
-        points, normals, basis = scan.points[found.own], found.normals, every_basis[found.own]
+        points, normals, basis = found.points, found.normals, every_basis[found.own]
         if len(points) < LEAST_MATCHED:
             return None
 
@@ -232,7 +233,7 @@ class ScanMatcher:
             middle = len(distances) // 2
             scale = max(2.0 * sigma, 1.5 * float(np.partition(distances, middle)[middle]))
             sums = keyframe.sums(basis, rows, index, scale)
-            held = _held(sums.pose_hessian, sums.feigned)
+            held = held_directions(sums.pose_hessian, sums.feigned)
             of_all = np.zeros((12, 12))
             for k in range(0, 12, 3):
                 of_all[k : k + 3, k : k + 3] = held
@@ -279,11 +280,15 @@ def _said_by_scan(
     return increment, cov
 
 
-def _held(pose_hessian: FloatArray, feigned: FloatArray) -> FloatArray:
+def held_directions(pose_hessian: FloatArray, feigned: FloatArray) -> FloatArray:
     """Projection (3, 3) of a change of the pose [m, rad] on what walls hold.
 
     Along a bare corridor the information is not zero: normals are noisy, so every line seems to hold a
     little. How much that is on average is known; a direction with hardly more than that is held by nothing.
+
+    Args:
+        pose_hessian: (3, 3) by the pose, for distances of unit variance.
+        feigned: (3, 3) share of it that noise of the normals has on average.
 
     Source: after Zhang, Kaess and Singh, "On degeneracy of optimization-based state estimation problems",
     ICRA 2016; here noise is the measure.

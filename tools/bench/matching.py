@@ -1,8 +1,8 @@
 """Scan matching beside small-gicp, on the same clouds: the scans of the demo's walk, already deskewed.
 
-small-gicp knows neither beams nor planar clouds: it gets them deskewed by us, and the motion between two scans
-before as its first guess. Its GICP needs surfaces in space, so a cloud stands there three times, one above the
-other; its ICP takes the flat cloud. How far each is off is in the names of the peers.
+small-gicp knows neither beams nor planar clouds: it gets them deskewed by us, and the motion between the two
+scans before as its first guess. Its GICP needs surfaces in space, so a cloud stands there three times, one
+above the other; its ICP takes the flat cloud. How far each is off is in the names of the peers.
 """
 
 from collections.abc import Callable
