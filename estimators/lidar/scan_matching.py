@@ -9,6 +9,7 @@ again, and a direction that no wall holds comes out wide.
 """
 
 from dataclasses import dataclass
+from itertools import product
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -35,6 +36,10 @@ LEAST_MATCHED = 10
 CONVERGED = 1e-4
 """A step of the pose that is smaller [m, rad] is the last."""
 MOST_ITERATIONS = 20
+MOST_STEPS = np.array([3, 3, 20])
+"""So many steps are searched at most to either side along x, y and in yaw."""
+STARTING_POINTS = 100
+"""With about so many points the start of a match is looked for."""
 
 _LEAST_VARIANCE = 1e-9
 """Of a pose [m^2, rad^2], so that no covariance is singular."""
@@ -195,6 +200,43 @@ class ScanMatcher:
         self._cov = turn @ self._cov @ turn.T
         self.points_cov = self._cov[:3, :3]
 
+    def _start(
+        self,
+        keyframe: "LineMap",
+        points: FloatArray,
+        normals: FloatArray,
+        basis: FloatArray,
+        predicted: FloatArray,
+        doubt: FloatArray,
+        dt: float,
+    ) -> FloatArray:
+        """States (12,) near which the match is looked for: the predicted ones, or what fits best round about.
+
+        The search covers twice the doubt (3,) of the prediction in steps as wide as a point may be off. With
+        many scans a second, and walls near by, there is nothing to search.
+
+        Source: Olson, "Real-time correlative scan matching", ICRA 2009.
+        """
+        reach = self._config.max_correspondence
+        far = float(np.percentile(np.hypot(points[:, 0], points[:, 1]), 75))
+        steps = reach / np.array([1.0, 1.0, max(far, reach)])
+        x, y, yaw = (np.minimum(2.0 * doubt // steps, MOST_STEPS)).astype(int)
+        if not (x or y or yaw):
+            return predicted
+        thin = slice(None, None, -(-len(points) // STARTING_POINTS))
+        few, faces, at = (np.ascontiguousarray(column[thin]) for column in (points, normals, basis))
+        best, best_score = predicted, -1.0
+        for offset in sorted(product(range(-x, x + 1), range(-y, y + 1), range(-yaw, yaw + 1)), key=_size):
+            states = predicted.copy()
+            states[_NEWEST] += steps * offset
+            # The acceleration that leads there is constant.
+            states[9:] += steps * offset * (2.0 / dt)
+            rows, index = keyframe.match(few, faces, at, states)
+            score = float((1.0 / (1.0 + (rows[index >= 0, 0] * (4.0 / reach)) ** 2)).sum())
+            if score > best_score:
+                best, best_score = states, score
+        return best
+
     def _moved_far(self) -> bool:
         return bool(
             np.hypot(self._state[0], self._state[1]) > self._config.keyframe_distance
@@ -223,7 +265,8 @@ class ScanMatcher:
         prior[:6, :6] += np.linalg.inv(self._cov)
         predicted = np.concatenate([self._state, F @ self._state])
 
-        states = predicted
+        doubt = np.sqrt(np.diag(F @ self._cov @ F.T + Q)[:3])
+        states = self._start(keyframe, points, normals, basis, predicted, doubt, dt)
         for _ in range(MOST_ITERATIONS):
             rows, index = keyframe.match(points, normals, basis, states)
             distances = np.abs(rows[index >= 0, 0])
@@ -278,6 +321,10 @@ def _said_by_scan(
     increment = predicted[_NEWEST] + correction @ held
     increment[2] = wrap_angle(increment[2])
     return increment, cov
+
+
+def _size(offset: tuple[int, int, int]) -> int:
+    return sum(step * step for step in offset)
 
 
 def held_directions(pose_hessian: FloatArray, feigned: FloatArray) -> FloatArray:
