@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from scipy.stats import chi2
 
 from estimators.geometry import between, compose, inverse, rotation, wrap_angle
-from estimators.lidar.scan_matching import held_directions
+from estimators.lidar.scan_fit import held_directions
 from estimators.messages import FloatArray, PoseIncrement
 
 if TYPE_CHECKING:
