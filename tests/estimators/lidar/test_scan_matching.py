@@ -145,8 +145,8 @@ def test_covariance_of_increments_is_of_the_size_of_their_errors(speed: float) -
         for increment in increments[1:]:
             error = error_of(increment, Loop(speed))
             nees.append(error @ np.linalg.solve(increment.cov, error))
-    # Errors of consecutive increments are correlated: their mean is not chi-square. It claims too little rather
-    # than too much: the keyframe's own end is in the covariance, without which this is 3.4 to 4.1.
+    # Errors of consecutive increments are correlated: their mean is not chi-square. It claims too little
+    # rather than too much: the keyframe's own end is in the covariance, without which this is 3.4 to 4.1.
     assert 3.0 / 2.0 < np.mean(nees) < 3.2
 
 
