@@ -281,6 +281,50 @@ def replay(
     )
 
 
+@app.command("map")
+def make_map(
+    log: Annotated[Path, typer.Argument(metavar="LOG", help="Log (MCAP) of a run, demo or simulation.")],
+    out_file: Annotated[
+        Path, typer.Option("--out", metavar="FILE", help="Map (YAML) to write, with a PNG beside it.")
+    ] = Path("map.yaml"),
+    estimator: Annotated[
+        str | None,
+        typer.Option("--estimator", metavar="NAME", help="Whose poses are used. Default: the log's."),
+    ] = None,
+    sets: Sets = None,
+) -> None:
+    """Make a floor plan of what the LiDAR saw in a log, as a picture and a YAML file.
+
+    The files follow the convention of the ROS map_server, which other tools read, too.
+    """
+    from companion.log import Log
+    from companion.map_file import save_map
+    from companion.mapping import survey
+    from companion.replay import config_of
+    from estimators import ESTIMATORS
+
+    if out_file.suffix not in (".yaml", ".yml"):
+        raise UserError(f"--out {out_file}: the name must end in .yaml")
+    opened = Log(log)
+    config = config_of(opened, sets or [])
+    name = estimator or config.pipeline.estimator
+    if name not in ESTIMATORS:
+        raise UserError(f"--estimator: unknown estimator {name!r}, there are: {', '.join(ESTIMATORS)}")
+    with _progress() as progress:
+        bar = progress.add_task(log.name, total=1.0)
+        made = survey(opened, config, name, lambda share: progress.update(bar, completed=share))
+        progress.update(bar, completed=1.0)
+    save_map(made.floor, out_file)
+    rows, columns = made.floor.occupied.shape
+    cell = made.floor.cell
+    out.print(
+        f"{out_file}  {columns * cell:.1f} m x {rows * cell:.1f} m in cells of {cell:g} m, "
+        f"{made.inserted} of {made.scans} scans",
+        highlight=False,
+        soft_wrap=True,
+    )
+
+
 @evaluate_app.command("scenario")
 def evaluate(
     scenario: Scenario_,

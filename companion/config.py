@@ -25,6 +25,7 @@ from drivers.port import parse_address
 from estimators import ESTIMATORS, estimator_config_class
 from estimators.base import Setup, Start
 from estimators.lidar.scan_matching import ScanMatcher
+from estimators.lidar.scan_preparation import ScanPreparation
 from estimators.messages import FloatArray
 from estimators.relocation.recovery import Recovering
 from estimators.trilateration import AnchorGeometryError, check_anchor_geometry
@@ -197,6 +198,7 @@ class Config(Table):
     start: StartTable
     sensor: dict[str, SensorTable] = Field(min_length=1)
     pipeline: PipelineTable = Field(default_factory=PipelineTable)
+    scan_preparation: ScanPreparation.Config = Field(default_factory=ScanPreparation.Config)
     scan_matcher: ScanMatcher.Config = Field(default_factory=ScanMatcher.Config)
     estimator: Any = Field(
         default_factory=dict, validate_default=True, description="a table for each estimator, by name"

@@ -22,10 +22,10 @@ from estimators.messages import Measurement, PoseEstimate, PoseIncrement, RangeF
 
 
 class FrontEnd(Protocol):
-    """Turns scans into motion."""
+    """Turns scans, or what else tells motion, into increments."""
 
-    def update(self, scan: Scan) -> PoseIncrement | None:
-        """Increment up to the end of the scan; None when the scan gives none."""
+    def update(self, measurement: Measurement) -> PoseIncrement | None:
+        """Increment up to the time of the measurement; None when it gives none."""
         ...
 
 
@@ -58,7 +58,7 @@ class Pipeline:
     """Front end and estimators side by side on the same measurements.
 
     Args:
-        front_end: scan matcher.
+        front_end: gives the increments.
         estimators: name -> estimator.
     """
 
@@ -69,10 +69,9 @@ class Pipeline:
     def step(self, measurement: Measurement) -> list[Outcome]:
         """Process one measurement; a scan also yields the outcome of its increment."""
         outcomes = [self._update(measurement)]
-        if isinstance(measurement, Scan):
-            increment = self._front_end.update(measurement)
-            if increment is not None:
-                outcomes.append(self._update(increment))
+        increment = self._front_end.update(measurement)
+        if increment is not None:
+            outcomes.append(self._update(increment))
         return outcomes
 
     def poses_at(self, stamp_ns: int) -> dict[str, PoseEstimate | None]:
@@ -147,10 +146,14 @@ def make_sensors(config: Config) -> dict[str, Sensor]:
 def make_parts(config: Config, names: list[str]) -> tuple[FrontEnd, dict[str, Estimator]]:
     """Front end and the named estimators with the site's settings."""
     setup = config.setup()
-    front_end = ScanMatcher(config.scan_matcher, config.lidar_mounting())
-    return front_end, {
+    return make_front_end(config), {
         name: make_estimator(name, config.estimator_config(name), setup, config.relocation) for name in names
     }
+
+
+def make_front_end(config: Config) -> FrontEnd:
+    """What turns the site's scans into increments."""
+    return ScanMatcher(config.scan_matcher, config.lidar_mounting(), config.scan_preparation)
 
 
 def make_pipeline(config: Config, names: list[str]) -> Pipeline:

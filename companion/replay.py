@@ -67,10 +67,11 @@ class _TimedFrontEnd:
         self._front_end = front_end
         self._stopwatch = stopwatch
 
-    def update(self, scan: Scan) -> PoseIncrement | None:
+    def update(self, measurement: Measurement) -> PoseIncrement | None:
         begin = time.perf_counter()
-        increment = self._front_end.update(scan)
-        self._stopwatch.note(begin)
+        increment = self._front_end.update(measurement)
+        if isinstance(measurement, Scan):
+            self._stopwatch.note(begin)
         return increment
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from companion.estimator_choice import chosen_settings, split_choice
 from companion.evaluate import Errors, Reference, compare
 from companion.log import Truth
-from companion.pipeline import Chain, Outcome, Pipeline
+from companion.pipeline import Chain, Outcome, Pipeline, make_front_end
 from companion.range_score import RangeScore, TrueExcess
 from companion.sim.measurements import MeasuredWalk, measure, setup_of
 from companion.sim.scenario import Scenario, load_scenario
@@ -19,7 +19,6 @@ from estimators import make_estimator
 from estimators.base import Estimator, Report, Setup, Verdict
 from estimators.bounds import landmark_information, posterior_bound, range_information
 from estimators.lidar.dead_reckoning import DeadReckoning
-from estimators.lidar.scan_matching import ScanMatcher
 from estimators.messages import Measurement, PoseEstimate, RangeFrame
 
 UWB_ALONE, LIDAR_ALONE = "uwb_ls", "lidar"
@@ -171,8 +170,7 @@ def _run_chain(
 ) -> tuple[list[Truth], list[int], list[Outcome]]:
     """The whole chain from emulated bytes on, in memory; poses at its ticks."""
     config = scenario.config
-    front_end = ScanMatcher(config.scan_matcher, config.lidar_mounting())
-    chain = Chain(config, START_NS, Pipeline(front_end, estimators), next(iter(estimators)))
+    chain = Chain(config, START_NS, Pipeline(make_front_end(config), estimators), next(iter(estimators)))
     truths: list[Truth] = []
     instants: list[int] = []
     outcomes: list[Outcome] = []

@@ -17,11 +17,11 @@ import typer
 from rich.console import Console
 from rich.progress import Progress
 
-from tools.bench import chain, decoders, smoother
+from tools.bench import chain, decoders, matching, smoother
 from tools.bench.decoders import DisagreementError
 from tools.bench.rows import ROUNDS, TOLERANCE, Row, measure, shortfalls, table
 
-BENCHMARKS = {**decoders.BENCHMARKS, **chain.BENCHMARKS, **smoother.BENCHMARKS}
+BENCHMARKS = {**decoders.BENCHMARKS, **matching.BENCHMARKS, **chain.BENCHMARKS, **smoother.BENCHMARKS}
 BASELINE = Path(__file__).with_name("baseline.json")
 
 
