@@ -138,7 +138,7 @@ def run(
         typer.Option(
             "--mavlink",
             metavar="URL",
-            help="pymavlink device string of the autopilot, e.g. /dev/ttyAMA0 or udpout:host:14550.",
+            help="Device string of the autopilot, /dev/ttyAMA0,921600 or udpout:host:14550 or tcp:host:5760.",
         ),
     ] = None,
     sets: Sets = None,
@@ -149,9 +149,13 @@ def run(
     sent while its health is ok or degraded.
     """
     from companion.live import LiveRun
+    from companion.mavlink.parameters import saved_settings
 
     assignments = [*(sets or []), *([f"mavlink.url={mavlink}"] if mavlink is not None else [])]
     config = load_config(_named(site, "sites"), assignments)
+    if config.mavlink.parameter_file:
+        saved = saved_settings(Path(config.mavlink.parameter_file))
+        config = load_config(_named(site, "sites"), [*saved, *assignments])
     folder = folder or Path("out") / datetime.now().astimezone().strftime("run-%Y%m%d-%H%M%S")
     begin = time.monotonic()
 
