@@ -5,10 +5,10 @@ from pymavlink.dialects.v20 import all as mavlink2
 
 from companion.config import Config
 from companion.mavlink.link import is_network
-from companion.mavlink.pose_out import NedPose
 from companion.mavlink.profiles import PROFILES
 from companion.mavlink.session import HEARTBEAT_PERIOD_NS, TIMESYNC_PERIOD_NS
 from drivers.mavlink_frames import MavlinkMessage
+from estimators.messages import PoseEstimate
 
 MOST = 0.7
 """Share of a link that may be planned for: requests, texts and parameters come on top."""
@@ -22,10 +22,10 @@ def bytes_per_second(config: Config) -> float:
     profile = PROFILES["ardupilot" if table.profile == "auto" else table.profile]
     # Zeros at the end of a message are not sent: nothing may be zero here.
     ones = np.ones(3)
-    pose = NedPose(ones, ones, np.eye(6) + 1.0, velocity=ones, velocity_cov=np.eye(3) + 1.0)
+    pose = PoseEstimate(1 << 60, np.ones((4, 4)), np.eye(6) + 1.0, 0, ones, np.eye(3) + 1.0)
     heartbeat = mavlink2.MAVLink_heartbeat_message(18, 8, 1, 1, 4, 3)
     timesync = mavlink2.MAVLink_timesync_message(1 << 62, 1 << 62)
-    poses = sum(_size(message) for message in profile.messages(pose, 1 << 62, table, 255, 100))
+    poses = sum(_size(message) for message in profile.messages(pose, 1.0, table, 255, 100))
     total = poses * config.pipeline.rate
     total += _size(heartbeat) * 1e9 / HEARTBEAT_PERIOD_NS
     # Our requests, and answers to as many.

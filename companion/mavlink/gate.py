@@ -15,7 +15,7 @@ from estimators.messages import PoseEstimate
 
 _LONGEST_GAP = 1.0
 """Motion is made allowance for over this time at most [s]: after more, the autopilot has drifted itself."""
-_SIGMAS = 3.0
+_SIGMAS = 4.0  # three of ten thousand distances in the plane are farther
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +48,7 @@ class SendGate:
         self._good_since_ns: int | None = None
         self._last: PoseEstimate | None = None
         self._sent: PoseEstimate | None = None
-        self._sending = False
+        self._sending = self._has_jumped = False
         self._why_held = ""
 
     def judge(self, pose: PoseEstimate | None, health: Health, now_ns: int) -> Decision:
@@ -65,11 +65,8 @@ class SendGate:
         if self._last is not None and self._last.reset_counter == pose.reset_counter:
             jump = self._jump(self._last, pose)
             if jump:
-                self._sending, self._good_since_ns, self._why_held = (
-                    False,
-                    now_ns,
-                    f"the pose jumped by {jump}",
-                )
+                self._sending, self._has_jumped = False, True
+                self._good_since_ns, self._why_held = now_ns, f"the pose jumped by {jump}"
         if self._good_since_ns is None:
             self._good_since_ns, self._why_held = now_ns, "waiting whether it stays good"
         self._last = pose
@@ -77,11 +74,11 @@ class SendGate:
             return Decision(False, self._resets, self._why_held)
         if self._sent is not None and self._is_reset(self._sent, pose):
             self._resets = (self._resets + 1) % 256
-        self._sent, self._sending = pose, True
+        self._sent, self._sending, self._has_jumped = pose, True, False
         return Decision(True, self._resets)
 
     def _is_reset(self, sent: PoseEstimate, pose: PoseEstimate) -> bool:
-        if sent.reset_counter != pose.reset_counter:
+        if self._has_jumped or sent.reset_counter != pose.reset_counter:
             return True
         return not self._sending and bool(self._jump(sent, pose))
 

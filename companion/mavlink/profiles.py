@@ -3,16 +3,16 @@
 Source: MAVLink common.xml; ArduPilot AP_VisualOdom and AP_NavEKF3; PX4 EKF2 and its MAVLink receiver.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import nan, pi
 
 import numpy as np
 from pymavlink.dialects.v20 import all as mavlink2
 
-from companion.mavlink.pose_out import NedPose
+from companion.mavlink.pose_out import NedPose, to_ned
 from companion.mavlink_table import MavlinkTable
 from drivers.mavlink_frames import MavlinkMessage
-from estimators.messages import FloatArray
+from estimators.messages import FloatArray, PoseEstimate
 
 UPPER = np.triu_indices(6)
 """How the 21 numbers of a covariance stand in its matrix: row by row, from the diagonal on."""
@@ -41,40 +41,44 @@ class Profile:
     takes_speed: bool
 
     def messages(
-        self, ned: NedPose, usec: int, table: MavlinkTable, reset_counter: int, quality: int
+        self, pose: PoseEstimate, map_heading: float, table: MavlinkTable, reset_counter: int, quality: int
     ) -> list[MavlinkMessage]:
-        """Messages that carry a pose; none when anything in it is not finite.
+        """Messages that carry a pose; none when anything in it is not finite, or a variance negative.
+
+        Their stamp is the time for which the pose holds, on the clock that TIMESYNC is answered with.
 
         Args:
-            ned: the pose.
-            usec: time for which it holds, on the clock that TIMESYNC is answered with [us].
+            pose: in the map.
+            map_heading: compass heading of the map's x axis [rad].
             table: which messages, and what of the pose the autopilot uses.
             reset_counter: 0 to 255, grows with every jump.
             quality: 1 to 100 [%].
         """
-        cov = reported_covariance(ned.cov, table)
-        speed = None if ned.velocity is None or ned.velocity_cov is None else ned.velocity
-        angles = ned.roll_pitch_yaw if table.heading else np.full(3, nan)
-        used = [ned.position, cov, ned.roll_pitch_yaw]
-        used += [] if ned.velocity is None or ned.velocity_cov is None else [ned.velocity, ned.velocity_cov]
-        if not all(np.isfinite(values).all() for values in used):
+        covs = [pose.cov] if pose.velocity_cov is None else [pose.cov, pose.velocity_cov]
+        if any((np.diag(cov) < 0.0).any() for cov in covs):
             return []
-        covariance = cov[UPPER].tolist() if table.covariance == "full" else _UNKNOWN
+        pose = replace(pose, cov=reported_covariance(pose.cov, table))
+        parts = [pose.T_map_body, pose.cov, pose.velocity, pose.velocity_cov]
+        if not all(np.isfinite(part).all() for part in parts if part is not None):
+            return []
+        ned, usec = to_ned(pose, map_heading), pose.stamp_ns // 1000
+        covariance = ned.cov[UPPER].tolist() if table.covariance == "full" else _UNKNOWN
         if table.message == "odometry":
             return [self._odometry(ned, usec, table, covariance, reset_counter, quality)]
+        angles = ned.roll_pitch_yaw.tolist() if table.heading else [nan] * 3
+        position = ned.position.tolist()
         messages = [
             mavlink2.MAVLink_vision_position_estimate_message(
-                usec, *ned.position.tolist(), *angles.tolist(), covariance, reset_counter
+                usec, *position, *angles, covariance, reset_counter
             )
         ]
-        if table.speed and self.takes_speed and speed is not None:
-            assert ned.velocity_cov is not None
-            known = table.covariance == "full"
-            speed_cov = _floored(ned.velocity_cov).ravel().tolist() if known else _UNKNOWN_SPEED
+        if table.speed and self.takes_speed and ned.velocity is not None and ned.velocity_cov is not None:
+            speed_cov = _UNKNOWN_SPEED
+            if table.covariance == "full":
+                speed_cov = _floored(ned.velocity_cov).ravel().tolist()
+            speed = ned.velocity.tolist()
             messages.append(
-                mavlink2.MAVLink_vision_speed_estimate_message(
-                    usec, *speed.tolist(), speed_cov, reset_counter
-                )
+                mavlink2.MAVLink_vision_speed_estimate_message(usec, *speed, speed_cov, reset_counter)
             )
         return messages
 
@@ -144,7 +148,7 @@ def reported_covariance(cov: FloatArray, table: MavlinkTable) -> FloatArray:
     height that it does not use must not make x and y look worse than they are.
 
     Args:
-        cov: of position [m] and angles [rad] in NED.
+        cov: of position [m] and angles [rad]; the plane may be that of the map or of NED.
         table: what of the pose the autopilot uses.
     """
     cov = cov.copy()

@@ -12,7 +12,6 @@ from companion.mavlink.endpoint import Endpoint
 from companion.mavlink.gate import Decision, SendGate
 from companion.mavlink.link import GROUND, NAME, is_network
 from companion.mavlink.parameters import Parameter, ParameterServer
-from companion.mavlink.pose_out import to_ned
 from companion.mavlink.profiles import Profile, profile_of
 from companion.mavlink.requests import OriginKeeper, StreamRequests, wanted_rates
 from companion.mavlink.signing import SigningClock
@@ -191,11 +190,7 @@ class MavlinkSession:
             if spacing_ns < max(profile.least_spacing_ns, 1):
                 return
         messages = profile.messages(
-            to_ned(pose, heading),
-            pose.stamp_ns // 1000,
-            self.config.mavlink,
-            decision.reset_counter,
-            QUALITY[health.state],
+            pose, heading, self.config.mavlink, decision.reset_counter, QUALITY[health.state]
         )
         for message in messages:
             self._send(NAME, message)
@@ -208,7 +203,7 @@ class MavlinkSession:
         identity = self.identity
         if identity.rival is not None and not self._rival_told:
             self._rival_told = True
-            text = f"several autopilots, {identity.rival} is one: set mavlink.autopilot_id"
+            text = "two autopilots heard: set mavlink.autopilot_id"
             self._announcer.say(mavlink2.MAV_SEVERITY_WARNING, text)
         if identity.system is None or identity.heard_ns is None:
             return

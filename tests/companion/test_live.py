@@ -16,8 +16,8 @@ from pymavlink import mavutil
 from pymavlink.dialects.v20 import common as mavlink2
 
 from companion.log import Direction, Log, RawChunk
-from companion.mavlink.pose_out import ned_pose
 from companion.replay import config_of, replay, tum_line
+from companion.sim.autopilot import ned_pose
 from tests.conftest import SITE, write_scenario
 
 AUTOPILOT = 42
