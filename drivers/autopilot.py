@@ -120,8 +120,9 @@ class Autopilot:
         kind = message.get_type()
         rank = _IMU_RANKS[kind]
         is_ardupilot = self.identity.kind == mavlink2.MAV_AUTOPILOT_ARDUPILOTMEGA
-        # Nothing says what the units of another autopilot's RAW_IMU are. Its other sensors have an id.
-        if rank < self._imu_rank or (kind == "RAW_IMU" and not is_ardupilot) or getattr(message, "id", 0):
+        is_second = "id" in message.fieldnames and message.id != 0
+        # Nothing says what the units of another autopilot's RAW_IMU are.
+        if rank < self._imu_rank or is_second or (kind == "RAW_IMU" and not is_ardupilot):
             return None
         self._imu_rank = rank
         boot_ns = message.time_boot_ms * _MS if kind == "SCALED_IMU" else message.time_usec * _US

@@ -82,7 +82,8 @@ class Near:
         """Go on until something is so, at most for 20 s."""
         end = time.monotonic() + 20.0
         while not until():
-            assert (now := time.monotonic()) < end
+            now = time.monotonic()
+            assert now < end
             if now >= self._due:
                 self._due = max(self._due + TICK, now)
                 now_ns = time.monotonic_ns()
