@@ -194,7 +194,12 @@ class Config(Table):
 
     @field_validator("mavlink")
     @classmethod
-    def _one_odometry(cls, mavlink: MavlinkTable, info: ValidationInfo) -> MavlinkTable:
+    def _fits_the_site(cls, mavlink: MavlinkTable, info: ValidationInfo) -> MavlinkTable:
+        origin = info.data["site"].origin if "site" in info.data else None
+        if mavlink.raw_ranges and (origin is None or mavlink.align != "site"):
+            raise ValueError(
+                'raw_ranges give anchors by latitude and longitude: set site.origin, align = "site"'
+            )
         has_lidar = any(table.driver == "rplidar" for table in info.data.get("sensor", {}).values())
         if has_lidar and (mavlink.inputs.odometry or mavlink.inputs.wheels):
             raise ValueError(

@@ -178,6 +178,8 @@ class LiveRun:
             self.status.stale_ticks += 1
             pose = None
         packed = self._session.poses_packed
+        for outcome in tick.outcomes:
+            self._session.observe(outcome.measurement, outcome.reports[self._primary])
         self._session.tick(pose, tick.health, now_ns)
         if MAVLINK in self._send_mavlink():
             self.status.poses_sent += self._session.poses_packed - packed

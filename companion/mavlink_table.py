@@ -74,6 +74,9 @@ class MavlinkTable(BaseModel):
     )
     signing_key: str = Field("", description="file with the key of 32 bytes, raw or as 64 hex digits")
     obstacles: bool = Field(False, description="OBSTACLE_DISTANCE from the LiDAR's scans")
+    obstacle_range: float = Field(
+        12.0, gt=1, le=600, description="the LiDAR sees no farther: free sectors are free up to there [m]"
+    )
     raw_ranges: bool = Field(False, description="RANGING_BEACON for every accepted range; needs site.origin")
     parameter_file: str = Field(
         "", description="parameters changed by a ground station are kept there; empty = until the next start"

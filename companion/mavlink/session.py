@@ -6,6 +6,7 @@ from pymavlink.dialects.v20 import all as mavlink2
 
 from companion.config import Config
 from companion.health import Health, State
+from companion.mavlink import obstacles
 from companion.mavlink.alignment import CompassAlignment
 from companion.mavlink.announcer import Announcer
 from companion.mavlink.endpoint import Endpoint
@@ -13,11 +14,13 @@ from companion.mavlink.gate import Decision, SendGate
 from companion.mavlink.link import GROUND, NAME, is_network
 from companion.mavlink.parameters import Parameter, ParameterServer
 from companion.mavlink.profiles import Profile, profile_of
+from companion.mavlink.ranging import RangingBeacons
 from companion.mavlink.requests import OriginKeeper, StreamRequests, wanted_rates
 from companion.mavlink.signing import SigningClock
 from drivers.autopilot_clock import AutopilotClock
 from drivers.mavlink_frames import AutopilotIdentity, MavlinkMessage
-from estimators.messages import PoseEstimate
+from estimators.base import Report
+from estimators.messages import Measurement, PoseEstimate, RangeFrame, Scan
 
 HEARTBEAT_PERIOD_NS = 1_000_000_000
 TIMESYNC_PERIOD_NS = 100_000_000
@@ -75,6 +78,8 @@ class MavlinkSession:
         self._streams: StreamRequests | None = None
         self._parameters = ParameterServer(config, self._parameter_set, self._begin_alignment)
         self._lists_to = NAME
+        self._beacons = RangingBeacons(config) if table.raw_ranges else None
+        self._obstacles_ns: int | None = None
         self._alignment = CompassAlignment()
         self._pose: PoseEstimate | None = None
         self._now_ns = self._heartbeat_due_ns = self._timesync_due_ns = 0
@@ -127,6 +132,21 @@ class MavlinkSession:
             elif self.config.mavlink.forward:
                 for other in self.endpoints.keys() - {name}:
                     self.endpoints[other].forward(message)
+
+    def observe(self, measurement: Measurement, report: Report) -> None:
+        """Take a measurement, and what the estimator made of it, for what is sent besides the pose."""
+        table = self.config.mavlink
+        if isinstance(measurement, Scan) and table.obstacles:
+            end_ns = measurement.end_stamp_ns
+            if self._obstacles_ns is None or end_ns - self._obstacles_ns >= obstacles.LEAST_PERIOD_NS:
+                self._obstacles_ns = end_ns
+                message = obstacles.obstacle_distance(
+                    measurement, self.config.lidar_mounting(), table.obstacle_range
+                )
+                self.endpoints[NAME].send(message, self._system, obstacles.COMPONENT)
+        if isinstance(measurement, RangeFrame) and self._beacons is not None and self.autopilot is not None:
+            for message in self._beacons.messages(measurement, report, self.autopilot):
+                self._send(NAME, message)
 
     def tick(self, pose: PoseEstimate | None, health: Health, now_ns: int) -> None:
         """Put into what goes out what is due at `now_ns`: the pose when it may be sent, and all the rest.

@@ -25,7 +25,7 @@ FLIP = np.diag([1.0, -1.0, -1.0])
 class Line:
     """An autopilot and, beside it, an odometry computer."""
 
-    def __init__(self, kind: int = mavlink2.MAV_AUTOPILOT_ARDUPILOTMEGA, **settings: float) -> None:
+    def __init__(self, kind: float = mavlink2.MAV_AUTOPILOT_ARDUPILOTMEGA, **settings: float) -> None:
         self.sensor = Autopilot(Autopilot.Config.model_validate(settings))
         self.now_ns = BOOT_NS + 60_000 * MS
         self.say(mavlink2.MAVLink_heartbeat_message(2, kind, 0, 0, 3, 3))
