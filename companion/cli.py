@@ -26,6 +26,7 @@ from companion.config import default_toml, load_config, params_dir
 from companion.doctor import app as doctor
 from companion.errors import UserError
 from companion.evaluate_cli import app as evaluate_app
+from companion.params_cli import app as params_app
 
 if TYPE_CHECKING:
     from companion.live import LiveRun, LiveStatus
@@ -54,6 +55,7 @@ app = typer.Typer(
     add_completion=False,
 )
 app.add_typer(doctor, name="doctor")
+app.add_typer(params_app, name="params")
 app.add_typer(evaluate_app, name="evaluate", cls=_ScenarioUnlessNamed)
 out = Console()
 err = Console(stderr=True, highlight=False)

@@ -55,6 +55,9 @@ class ScriptedAutopilot:
         self.refuses_origin = 0
         self.heading = 0.0
         self.intervals: dict[int, float] = {}
+        self.parameters: dict[str, tuple[float, int]] = {}
+        self.read_only: set[str] = set()
+        self.deaf_to = 0
         self._due: dict[str, int] = {}
         self._out = bytearray()
 
@@ -78,6 +81,8 @@ class ScriptedAutopilot:
             match message.get_type():
                 case "TIMESYNC" if message.tc1 == 0:
                     self.say(mavlink2.MAVLink_timesync_message(self.boot_clock_ns(now_ns), message.ts1))
+                case "PARAM_REQUEST_READ" | "PARAM_SET" if message.param_id in self.parameters:
+                    self._answer_parameter(message)
                 case "SET_GPS_GLOBAL_ORIGIN" if message.target_system == self.ends.srcSystem:
                     if self.refuses_origin:
                         self.refuses_origin -= 1
@@ -87,6 +92,17 @@ class ScriptedAutopilot:
                     self.intervals[int(message.param1)] = message.param2 * 1e-6
                 case "COMMAND_LONG" if message.command == mavlink2.MAV_CMD_REQUEST_MESSAGE and self.origin:
                     self.say(mavlink2.MAVLink_gps_global_origin_message(*self.origin, 0))
+
+    def _answer_parameter(self, message: Any) -> None:
+        name = message.param_id
+        value, kind = self.parameters[name]
+        if self.deaf_to:
+            self.deaf_to -= 1
+            return
+        if message.get_type() == "PARAM_SET" and name not in self.read_only:
+            value = message.param_value
+            self.parameters[name] = (value, kind)
+        self.say(mavlink2.MAVLink_param_value_message(name.encode(), value, kind, 999, 0))
 
     def poll(self, now_ns: int) -> bytes:
         """What is due: HEARTBEAT, and messages that were asked for."""
