@@ -12,6 +12,7 @@ from companion.errors import UserError
 from companion.mavlink.endpoint import Endpoint
 from companion.mavlink.link import wire_opener
 from companion.mavlink.parameter_names import aliases
+from companion.mavlink.requests import command
 from drivers.errors import PortError
 from drivers.mavlink_frames import AutopilotIdentity, MavlinkMessage
 
@@ -56,6 +57,7 @@ class AutopilotClient:
         self._end = Endpoint(mavlink2.MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY, 0, None, None)
         self._identity = AutopilotIdentity()
         self._values: dict[str, Value] = {}
+        self._newest: dict[str, MavlinkMessage] = {}
         self._greet_at = 0.0
         self._listen(lambda: self._identity.system is not None, PATIENCE)
         if self._identity.system is None:
@@ -108,6 +110,19 @@ class AutopilotClient:
                 return is_same(self._values[name].number, number)
         return False
 
+    def message(self, kind: str, rate: float) -> MavlinkMessage | None:
+        """The next message of a kind, asked for at a rate [Hz]; None when the autopilot does not send it."""
+        number = getattr(mavlink2, f"MAVLINK_MSG_ID_{kind}")
+        self._newest.pop(kind, None)
+        for _ in range(TRIES):
+            self._send(
+                command(self._system, mavlink2.MAV_CMD_SET_MESSAGE_INTERVAL, float(number), 1e6 / rate)
+            )
+            self._listen(lambda: kind in self._newest, ANSWER_TIME)
+            if kind in self._newest:
+                return self._newest[kind]
+        return None
+
     @property
     def _is_px4(self) -> bool:
         return bool(self._identity.kind == mavlink2.MAV_AUTOPILOT_PX4)
@@ -157,6 +172,8 @@ class AutopilotClient:
             message.get_srcSystem() == self._identity.system
             and message.get_srcComponent() == mavlink2.MAV_COMP_ID_AUTOPILOT1
         )
+        if is_autopilots:
+            self._newest[message.get_type()] = message
         if is_autopilots and message.get_type() == "PARAM_VALUE":
             kind = message.param_type
             self._values[message.param_id] = Value(self._unpacked(message.param_value, kind), kind)

@@ -18,7 +18,7 @@ from companion.mavlink.budget import budget_warning
 from companion.mavlink.link import GROUND, wire_opener
 from companion.mavlink.link import NAME as MAVLINK
 from companion.mavlink.parameters import save_setting, setting_line
-from companion.mavlink.session import MavlinkSession
+from companion.mavlink.session import MavlinkSession, Watch
 from companion.mavlink.signing import SigningClock, read_key
 from companion.pipeline import Chain, Tick, make_pipeline
 from companion.replay import tum_line
@@ -69,12 +69,15 @@ class LiveRun:
         config: of the site.
         folder: gets `raw.mcap`, `config.toml` and `poses.tum`.
         say: takes one line for the operator when a port or the health changes.
+        watch: who else wants to hear the autopilot.
 
     Raises:
         UserError: the folder cannot be written, or the MAVLink device string makes no sense.
     """
 
-    def __init__(self, config: Config, folder: Path, say: Callable[[str], None]) -> None:
+    def __init__(
+        self, config: Config, folder: Path, say: Callable[[str], None], watch: Watch | None = None
+    ) -> None:
         self._inbox = Inbox([*config.sensor, MAVLINK, GROUND])
         self.status = LiveStatus(dropped=self._inbox.dropped)
         self._say = say
@@ -91,7 +94,7 @@ class LiveRun:
         key_file = config.mavlink.signing_key
         self._signing_clock = SigningClock(Path(key_file)) if key_file else None
         key = read_key(Path(key_file)) if key_file else None
-        self._session = MavlinkSession(config, key, self._signing_clock)
+        self._session = MavlinkSession(config, key, self._signing_clock, watch)
         start_ns = time.monotonic_ns()
         self._log = LogWriter(folder / "raw.mcap", config.to_toml(), start_ns)
         try:
@@ -173,14 +176,13 @@ class LiveRun:
             )
         self.status.pose, self.status.health = pose, tick.health
         now_ns = time.monotonic_ns()
-        if now_ns - tick.stamp_ns > self._period_ns:
-            # The loop fell behind: an autopilot is better off with a gap than with a burst of old poses.
-            self.status.stale_ticks += 1
-            pose = None
+        # The loop fell behind: an autopilot is better off with a gap than with a burst of old poses.
+        is_late = now_ns - tick.stamp_ns > self._period_ns
+        self.status.stale_ticks += is_late
         packed = self._session.poses_packed
         for outcome in tick.outcomes:
             self._session.observe(outcome.measurement, outcome.reports[self._primary])
-        self._session.tick(pose, tick.health, now_ns)
+        self._session.tick(pose, tick.health, now_ns, is_late)
         if MAVLINK in self._send_mavlink():
             self.status.poses_sent += self._session.poses_packed - packed
         if self._signing_clock is not None:

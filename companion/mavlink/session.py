@@ -1,6 +1,8 @@
 """What we say on MAVLink, and when, and what we make of what we hear. Free of I/O: bytes in, bytes out."""
 
 from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
 
 from pymavlink.dialects.v20 import all as mavlink2
 
@@ -41,6 +43,19 @@ _CAPABILITIES = (
 )
 
 
+@dataclass(frozen=True, slots=True)
+class Watch:
+    """Somebody else who wants to hear the autopilot.
+
+    Attributes:
+        rates: message name -> rate that it is asked for [Hz].
+        hear: takes every message of the autopilot, and when it arrived [ns].
+    """
+
+    rates: dict[str, float]
+    hear: Callable[[MavlinkMessage, int], None]
+
+
 class MavlinkSession:
     """Our component beside the autopilot, on its link and on that of a ground station.
 
@@ -48,6 +63,7 @@ class MavlinkSession:
         config: of the site.
         key: to sign with, or None.
         signing_clock: gives the signatures their timestamps; needed with a key.
+        watch: who else wants to hear the autopilot.
 
     Attributes:
         config: with the parameters that a ground station has set and that count at once.
@@ -58,9 +74,14 @@ class MavlinkSession:
     """
 
     def __init__(
-        self, config: Config, key: bytes | None = None, signing_clock: SigningClock | None = None
+        self,
+        config: Config,
+        key: bytes | None = None,
+        signing_clock: SigningClock | None = None,
+        watch: Watch | None = None,
     ) -> None:
         self.config = config
+        self._watch = watch
         self._changes: list[tuple[Parameter, Config]] = []
         table = config.mavlink
         timestamp = signing_clock.now if signing_clock is not None else None
@@ -148,18 +169,19 @@ class MavlinkSession:
             for message in self._beacons.messages(measurement, report, self.autopilot):
                 self._send(NAME, message)
 
-    def tick(self, pose: PoseEstimate | None, health: Health, now_ns: int) -> None:
+    def tick(self, pose: PoseEstimate | None, health: Health, now_ns: int, is_late: bool = False) -> None:
         """Put into what goes out what is due at `now_ns`: the pose when it may be sent, and all the rest.
 
         Args:
-            pose: newest; None when there is none, or it comes too late to be sent.
+            pose: newest; None when there is none.
             health: judgement of it.
             now_ns: time.
+            is_late: the pose was computed too late to be sent; that says nothing against the next.
         """
         dt, self._now_ns = (now_ns - self._now_ns) * 1e-9, now_ns
         self._pose = pose
         decision = self._gate.judge(pose, health, now_ns)
-        if pose is not None and decision.sends:
+        if pose is not None and decision.sends and not is_late:
             self._send_pose(pose, health, decision)
         overdue = now_ns - self._heartbeat_due_ns
         if overdue >= 0:
@@ -236,7 +258,10 @@ class MavlinkSession:
         if silent:
             return
         if self._streams is None:
-            self._streams = StreamRequests(wanted_rates(self.config.mavlink, identity.kind))
+            rates = wanted_rates(self.config.mavlink, identity.kind)
+            if self._watch is not None:
+                rates = {**rates, **self._watch.rates}
+            self._streams = StreamRequests(rates)
         requests = self._streams.poll(identity.system, self._now_ns)
         requests += self._origin.poll(identity.system, self._now_ns)
         if self._now_ns >= self._timesync_due_ns:
@@ -248,6 +273,8 @@ class MavlinkSession:
     def _hear_autopilot(self, message: MavlinkMessage, arrival_ns: int) -> None:
         if self._streams is not None:
             self._streams.hear(message)
+        if self._watch is not None:
+            self._watch.hear(message, arrival_ns)
         match message.get_type():
             case "TIMESYNC" if message.tc1 == 0:
                 # Halfway between arrival and answer, so that our own delay falls out.

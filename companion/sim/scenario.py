@@ -9,6 +9,7 @@ from pydantic import Field, ValidationInfo, field_validator
 
 from companion.config import Config, Coordinate, Table, known, load_config, parse_toml, read_text, validated
 from companion.errors import UserError
+from companion.sim.followed import FollowedTrajectory
 from companion.sim.gait import GaitTrajectory
 from companion.sim.lidar_models import LIDAR_MODELS
 from companion.sim.scenario_tables import (
@@ -157,7 +158,7 @@ class Scenario:
     config: Config
     seed: int
     world: World
-    trajectory: Trajectory | GaitTrajectory
+    trajectory: Trajectory | GaitTrajectory | FollowedTrajectory
     rng: np.random.Generator
 
 

@@ -197,3 +197,13 @@ def test_long_texts_are_put_together_again_by_their_chunks(length: int) -> None:
         assert {m.id for m in chunks} != {0}
         assert len(chunks[-1].text) < 50
         assert all(len(m.text) == 50 for m in chunks[:-1])
+
+
+def test_a_pose_that_comes_late_is_left_out_and_does_not_stop_the_stream() -> None:
+    flight = Flight(site())
+    flight.fly(3.0)
+    before = flight.session.poses_packed
+    for i in range(1, 31):
+        now_ns = flight.now_ns + i * TICK_NS
+        flight.session.tick(planar(1.0, 2.0, 10.0, now_ns), OK, now_ns, is_late=i % 3 == 0)
+    assert flight.session.poses_packed - before == 20
