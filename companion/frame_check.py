@@ -1,7 +1,7 @@
 """Do axes and signs agree: what a walk forward and a walk to the left should look like, and what they did.
 
-A LiDAR that is turned, a map that is mirrored, a heading that is off: each shows in the direction that a known
-walk takes. Angles are told as what is to be changed in the site file.
+A LiDAR that is turned, a map that is mirrored, a heading that is off: each shows in the direction that a
+known walk takes. Angles are told as what is to be changed in the site file.
 """
 
 from dataclasses import dataclass

@@ -91,8 +91,8 @@ def frames(
     """Say whether axes and signs agree, from a walk forward and a walk to the left.
 
     Put the robot on its start mark, disarmed, with some free metres ahead and to its left. It may turn for
-    the second walk or go sideways. Poses are sent to the autopilot as in a run; its compass and its own position
-    are compared, too.
+    the second walk or go sideways. Poses are sent to the autopilot as in a run; its compass and its own
+    position are compared, too.
 
     Exit codes: 0 all agrees, 1 something does not, 2 the call is wrong or there is no good pose.
     """
