@@ -16,8 +16,8 @@ from companion.config import load_config
 from companion.errors import UserError
 from companion.frame_check import Finding, judge_autopilot, judge_compass, judge_walk
 from companion.live import LiveRun
+from companion.mavlink.contact import Watch
 from companion.mavlink.pose_out import ned_from_map
-from companion.mavlink.session import Watch
 from drivers.mavlink_frames import MavlinkMessage
 from estimators.geometry import wrap_angle
 from estimators.messages import FloatArray

@@ -15,10 +15,11 @@ from companion.errors import UserError
 from companion.health import Health
 from companion.log import Direction, LogWriter, RawChunk
 from companion.mavlink.budget import budget_warning
+from companion.mavlink.contact import Watch
 from companion.mavlink.link import GROUND, wire_opener
 from companion.mavlink.link import NAME as MAVLINK
 from companion.mavlink.parameters import save_setting, setting_line
-from companion.mavlink.session import MavlinkSession, Watch
+from companion.mavlink.session import MavlinkSession
 from companion.mavlink.signing import SigningClock, read_key
 from companion.pipeline import Chain, Tick, make_pipeline
 from companion.replay import tum_line

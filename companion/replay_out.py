@@ -11,9 +11,10 @@ from companion.config import Config
 from companion.follow import RATES, FollowScore
 from companion.health import Health, State
 from companion.log import Log, RawChunk
+from companion.mavlink.contact import Watch
 from companion.mavlink.link import NAME, wire_opener
 from companion.mavlink.pose_out import to_ned
-from companion.mavlink.session import MavlinkSession, Watch
+from companion.mavlink.session import MavlinkSession
 from companion.pipeline import Chain, Tick, make_pipeline
 from drivers.port import Arrival, Port, PortEvent
 from estimators.messages import FloatArray, PoseEstimate

@@ -20,8 +20,8 @@ from companion.config import Config, OriginTable
 from companion.errors import UserError
 from companion.follow import RATES, FollowScore
 from companion.live import LiveRun
+from companion.mavlink.contact import Watch
 from companion.mavlink.pose_out import ned_from_map
-from companion.mavlink.session import Watch
 from companion.sim.emulate import Emulator
 from companion.sim.followed import FollowedTrajectory
 from companion.sim.scenario import Scenario

@@ -4,9 +4,10 @@ import numpy as np
 from pymavlink.dialects.v20 import all as mavlink2
 
 from companion.config import Config
+from companion.mavlink.contact import TIMESYNC_PERIOD_NS
 from companion.mavlink.link import is_network
 from companion.mavlink.profiles import PROFILES
-from companion.mavlink.session import HEARTBEAT_PERIOD_NS, TIMESYNC_PERIOD_NS
+from companion.mavlink.session import HEARTBEAT_PERIOD_NS
 from drivers.mavlink_frames import MavlinkMessage
 from estimators.messages import PoseEstimate
 

@@ -1,23 +1,21 @@
 """What we say on MAVLink, and when, and what we make of what we hear. Free of I/O: bytes in, bytes out."""
 
 from collections import Counter
-from collections.abc import Callable
-from dataclasses import dataclass
 
 from pymavlink.dialects.v20 import all as mavlink2
 
-from companion.config import Config
+from companion.config import Config, config_from_toml
 from companion.health import Health, State
 from companion.mavlink import obstacles
 from companion.mavlink.alignment import CompassAlignment
 from companion.mavlink.announcer import Announcer
+from companion.mavlink.contact import AutopilotContact, Watch
 from companion.mavlink.endpoint import Endpoint
 from companion.mavlink.gate import Decision, SendGate
 from companion.mavlink.link import GROUND, NAME, is_network
-from companion.mavlink.parameters import Parameter, ParameterServer
+from companion.mavlink.parameters import Parameter, ParameterServer, setting_line
 from companion.mavlink.profiles import Profile, profile_of
 from companion.mavlink.ranging import RangingBeacons
-from companion.mavlink.requests import OriginKeeper, StreamRequests, wanted_rates
 from companion.mavlink.signing import SigningClock
 from drivers.autopilot_clock import AutopilotClock
 from drivers.mavlink_frames import AutopilotIdentity, MavlinkMessage
@@ -25,9 +23,6 @@ from estimators.base import Report
 from estimators.messages import Measurement, PoseEstimate, RangeFrame, Scan
 
 HEARTBEAT_PERIOD_NS = 1_000_000_000
-TIMESYNC_PERIOD_NS = 100_000_000
-SILENT_NS = 5_000_000_000
-"""An autopilot that was not heard for so long is gone."""
 NETWORK_CAPACITY = 200_000.0
 """Bytes a second that a network link is taken to carry."""
 QUALITY = {State.OK: 100, State.DEGRADED: 50}
@@ -43,19 +38,6 @@ _CAPABILITIES = (
 )
 
 
-@dataclass(frozen=True, slots=True)
-class Watch:
-    """Somebody else who wants to hear the autopilot.
-
-    Attributes:
-        rates: message name -> rate that it is asked for [Hz].
-        hear: takes every message of the autopilot, and when it arrived [ns].
-    """
-
-    rates: dict[str, float]
-    hear: Callable[[MavlinkMessage, int], None]
-
-
 class MavlinkSession:
     """Our component beside the autopilot, on its link and on that of a ground station.
 
@@ -67,8 +49,6 @@ class MavlinkSession:
 
     Attributes:
         config: with the parameters that a ground station has set and that count at once.
-        identity: the autopilot.
-        clock: the autopilot's.
         poses_packed: poses given to the link.
         refused: messages of strangers, by system id.
     """
@@ -81,7 +61,7 @@ class MavlinkSession:
         watch: Watch | None = None,
     ) -> None:
         self.config = config
-        self._watch = watch
+        self._contact = AutopilotContact(config, watch)
         self._changes: list[tuple[Parameter, Config]] = []
         table = config.mavlink
         timestamp = signing_clock.now if signing_clock is not None else None
@@ -89,23 +69,28 @@ class MavlinkSession:
         self.endpoints = {
             name: Endpoint(table.component_id, i, key, timestamp) for i, name in enumerate(names)
         }
-        self.identity = AutopilotIdentity(table.autopilot_id)
-        self.clock = AutopilotClock()
         self.poses_packed = 0
         self.refused: Counter[int] = Counter()
         self._gate = SendGate(table.gate, table.heading)
         self._announcer = Announcer()
-        self._origin = OriginKeeper(config.site.origin)
-        self._streams: StreamRequests | None = None
         self._parameters = ParameterServer(config, self._parameter_set, self._begin_alignment)
         self._lists_to = NAME
         self._beacons = RangingBeacons(config) if table.raw_ranges else None
         self._obstacles_ns: int | None = None
         self._alignment = CompassAlignment()
         self._pose: PoseEstimate | None = None
-        self._now_ns = self._heartbeat_due_ns = self._timesync_due_ns = 0
+        self._now_ns = self._heartbeat_due_ns = 0
         self._sent: tuple[int, int] | None = None
-        self._boots, self._is_silent, self._rival_told = 0, False, False
+
+    @property
+    def identity(self) -> AutopilotIdentity:
+        """The autopilot, as far as it was heard."""
+        return self._contact.identity
+
+    @property
+    def clock(self) -> AutopilotClock:
+        """The autopilot's."""
+        return self._contact.clock
 
     @property
     def autopilot(self) -> int | None:
@@ -148,9 +133,11 @@ class MavlinkSession:
                 continue
             if is_autopilots and sender[1] == mavlink2.MAV_COMP_ID_AUTOPILOT1:
                 self._hear_autopilot(message, arrival_ns)
-            if self._is_for_us(message, endpoint):
+            target = getattr(message, "target_system", None), getattr(message, "target_component", 0)
+            if target[0] in (0, self._system) and target[1] in (0, endpoint.component):
                 self._answer(name, message)
-            elif self.config.mavlink.forward:
+            # What is for everybody is for the others, too.
+            if self.config.mavlink.forward and target != (self._system, endpoint.component):
                 for other in self.endpoints.keys() - {name}:
                     self.endpoints[other].forward(message)
 
@@ -179,7 +166,7 @@ class MavlinkSession:
             is_late: the pose was computed too late to be sent; that says nothing against the next.
         """
         dt, self._now_ns = (now_ns - self._now_ns) * 1e-9, now_ns
-        self._pose = pose
+        self._pose = pose if health.sends else None
         decision = self._gate.judge(pose, health, now_ns)
         if pose is not None and decision.sends and not is_late:
             self._send_pose(pose, health, decision)
@@ -189,7 +176,10 @@ class MavlinkSession:
             base = self._heartbeat_due_ns if overdue < HEARTBEAT_PERIOD_NS else now_ns
             self._heartbeat_due_ns = base + HEARTBEAT_PERIOD_NS
             self._send_all(_heartbeat(health, decision))
-        self._follow_autopilot()
+        for message in self._contact.poll(now_ns):
+            self._send(NAME, message)
+        for text in self._contact.take_news():
+            self._announcer.say(mavlink2.MAV_SEVERITY_WARNING, text)
         for message in self._announcer.poll(health, decision, now_ns):
             self._send_all(message)
         for message in self._parameters.poll(self.capacity(self._lists_to), max(dt, 0.0)):
@@ -240,64 +230,14 @@ class MavlinkSession:
             self._sent = self._now_ns, pose.stamp_ns
             self.poses_packed += 1
 
-    def _follow_autopilot(self) -> None:
-        """Ask the autopilot for what is needed, again when it was started anew."""
-        identity = self.identity
-        if identity.rival is not None and not self._rival_told:
-            self._rival_told = True
-            text = "two autopilots heard: set mavlink.autopilot_id"
-            self._announcer.say(mavlink2.MAV_SEVERITY_WARNING, text)
-        if identity.system is None or identity.heard_ns is None:
-            return
-        silent = self._now_ns - identity.heard_ns > SILENT_NS
-        if identity.boots != self._boots or (self._is_silent and not silent):
-            self._boots = identity.boots
-            self._origin.restart()
-            self._streams = None
-        self._is_silent = silent
-        if silent:
-            return
-        if self._streams is None:
-            rates = wanted_rates(self.config.mavlink, identity.kind)
-            if self._watch is not None:
-                rates = {**rates, **self._watch.rates}
-            self._streams = StreamRequests(rates)
-        requests = self._streams.poll(identity.system, self._now_ns)
-        requests += self._origin.poll(identity.system, self._now_ns)
-        if self._now_ns >= self._timesync_due_ns:
-            self._timesync_due_ns = self._now_ns + TIMESYNC_PERIOD_NS
-            requests.append(mavlink2.MAVLink_timesync_message(0, self._now_ns))
-        for message in requests:
-            self._send(NAME, message)
-
     def _hear_autopilot(self, message: MavlinkMessage, arrival_ns: int) -> None:
-        if self._streams is not None:
-            self._streams.hear(message)
-        if self._watch is not None:
-            self._watch.hear(message, arrival_ns)
-        match message.get_type():
-            case "TIMESYNC" if message.tc1 == 0:
-                # Halfway between arrival and answer, so that our own delay falls out.
-                ours_ns = (arrival_ns + self._now_ns) // 2
-                self._send(NAME, mavlink2.MAVLink_timesync_message(ours_ns, message.ts1))
-            case "TIMESYNC" if 0 <= arrival_ns - message.ts1 < 10 * SILENT_NS:
-                self.clock.answered(message.ts1, message.tc1, arrival_ns)
-            case "GPS_GLOBAL_ORIGIN":
-                was_far = self._origin.is_far
-                self._origin.hear(message)
-                if self._origin.is_far and not was_far:
-                    text = f"autopilot keeps another origin, {self._origin.distance:.0f} m from the site's"
-                    self._announcer.say(mavlink2.MAV_SEVERITY_WARNING, text)
-            case "ATTITUDE" if self._pose is not None:
-                told = self._alignment.outcome
-                self._alignment.add(message.yaw, self._pose.yaw, arrival_ns)
-                if self._alignment.outcome != told:
-                    self._announcer.say(mavlink2.MAV_SEVERITY_INFO, self._alignment.outcome)
-
-    def _is_for_us(self, message: MavlinkMessage, endpoint: Endpoint) -> bool:
-        system = getattr(message, "target_system", None)
-        component = getattr(message, "target_component", 0)
-        return system in (0, self._system) and component in (0, endpoint.component)
+        for answer in self._contact.hear(message, arrival_ns, self._now_ns):
+            self._send(NAME, answer)
+        if message.get_type() == "ATTITUDE" and self._pose is not None:
+            told = self._alignment.outcome
+            self._alignment.add(message.yaw, self._pose.yaw, arrival_ns)
+            if self._alignment.outcome != told:
+                self._announcer.say(mavlink2.MAV_SEVERITY_INFO, self._alignment.outcome)
 
     def _answer(self, name: str, message: MavlinkMessage) -> None:
         kind = message.get_type()
@@ -321,8 +261,11 @@ class MavlinkSession:
     def _parameter_set(self, parameter: Parameter, config: Config) -> None:
         self._changes.append((parameter, config))
         if parameter.applies_at_once:
-            self.config = config
-            self._gate.table = config.mavlink.gate
+            # This one alone: others that were set may have to wait for the next start.
+            self.config = config_from_toml(
+                self.config.to_toml(), "parameter", [setting_line(parameter, config)]
+            )
+            self._gate.table = self.config.mavlink.gate
         else:
             self._announcer.say(mavlink2.MAV_SEVERITY_INFO, f"{parameter.name} counts from the next start on")
 
@@ -333,7 +276,7 @@ class MavlinkSession:
             # The autopilot's heading may be ours by now: that would be measured against itself.
             why = "poses are being sent, restart first"
         elif self._pose is None:
-            why = "no pose yet"
+            why = "no good pose yet"
         else:
             self._alignment.begin(self._now_ns)
             return

@@ -152,6 +152,16 @@ def test_what_would_change_poses_counts_from_the_next_start_on() -> None:
     assert not any(parameter.applies_at_once for parameter, _ in changes)
 
 
+def test_what_waits_for_the_next_start_does_not_slip_in_with_what_counts_at_once() -> None:
+    pilot = Pilot()
+    pilot.set("OUT_HEADING", 0.0)
+    pilot.set("LIDAR_YAW", 12.5)
+    pilot.set("HLT_SIGMA_XY", 0.3)
+    assert pilot.config.health.max_sigma_xy == 0.3
+    assert pilot.config.mavlink.heading is True
+    assert pilot.config.body.lidar_yaw_deg == 0.0
+
+
 def test_every_parameter_is_a_setting_that_set_takes() -> None:
     config = load_config(SITE)
     lines: list[str] = []

@@ -273,6 +273,19 @@ def test_messages_are_passed_on_only_when_that_is_asked_for() -> None:
         assert ("SYS_STATUS" in kinds) is forward
 
 
+def test_what_is_for_everybody_is_answered_and_passed_on() -> None:
+    session = MavlinkSession(site(ground_url="udpin:0.0.0.0:14560", forward=True))
+    session.receive(NAME, heartbeat(SYSTEM), START_NS, START_NS)
+    ground = mavlink2.MAVLink(None, srcSystem=255, srcComponent=190)
+    for target, is_passed in ((0, True), (197, False)):
+        request = bytes(mavlink2.MAVLink_param_request_list_message(SYSTEM, target).pack(ground))
+        session.receive("mavlink_ground", request, START_NS, START_NS)
+        session.tick(None, OK, START_NS + 100_000_000)
+        out = session.take()
+        assert (request in out.get(NAME, b"")) is is_passed
+        assert "PARAM_VALUE" in {m.get_type() for m in messages(out["mavlink_ground"])}
+
+
 def test_a_ground_station_on_its_own_link_gets_state_but_no_poses() -> None:
     session = MavlinkSession(site(ground_url="udpin:0.0.0.0:14560", profile="ardupilot"))
     for i in range(90):
