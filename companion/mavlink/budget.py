@@ -5,7 +5,7 @@ from pymavlink.dialects.v20 import all as mavlink2
 
 from companion.config import Config
 from companion.mavlink.contact import TIMESYNC_PERIOD_NS
-from companion.mavlink.link import is_network
+from companion.mavlink.link import capacity
 from companion.mavlink.profiles import PROFILES
 from companion.mavlink.session import HEARTBEAT_PERIOD_NS
 from drivers.mavlink_frames import MavlinkMessage
@@ -44,15 +44,13 @@ def bytes_per_second(config: Config) -> float:
 def budget_warning(config: Config) -> str:
     """One line when the autopilot's link is too slow for what is planned; empty when it is not."""
     table = config.mavlink
-    if not table.url or is_network(table.url):
-        return ""
-    capacity = table.baud / 10.0
+    carried = capacity(table.url, table.baud)
     needed = bytes_per_second(config)
-    if needed <= MOST * capacity:
+    if carried is None or needed <= MOST * carried:
         return ""
     return (
-        f"mavlink.baud: {table.baud} baud carry {capacity:.0f} B/s, our messages take {needed:.0f} B/s "
-        f"({needed / capacity:.0%}, at most {MOST:.0%} are sane): raise the baud rate or lower pipeline.rate"
+        f"mavlink.url: {carried * 10:.0f} baud carry {carried:.0f} B/s, our messages take {needed:.0f} B/s "
+        f"({needed / carried:.0%}, at most {MOST:.0%} are sane): raise the baud rate or lower pipeline.rate"
     )
 
 

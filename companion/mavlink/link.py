@@ -48,11 +48,6 @@ class NetworkAddress:
         return f"{self.kind}:{self.host}:{self.port}"
 
 
-def is_network(url: str) -> bool:
-    """Whether a device string names a socket, not a serial line."""
-    return url.partition(":")[0] in _NETWORK
-
-
 def link_address(url: str, baud: int) -> NetworkAddress | PortAddress:
     """Read `udpout:host:port`, `udpin:...`, `tcp:...`, `tcpin:...`, `/dev/ttyAMA0`, `/dev/ttyAMA0,57600`.
 
@@ -81,6 +76,17 @@ def link_address(url: str, baud: int) -> NetworkAddress | PortAddress:
     if isinstance(address, AutoAddress):
         raise ValueError("an autopilot is not looked for, name its port")
     return address
+
+
+def capacity(url: str, baud: int) -> float | None:
+    """Bytes a second that a serial line carries, at ten bits a byte; None for a socket and for none at all.
+
+    Args:
+        url: device string that makes sense.
+        baud: of a serial line whose string names none.
+    """
+    address = link_address(url, baud) if url else None
+    return address.baud / 10.0 if isinstance(address, PortAddress) else None
 
 
 def wire_opener(url: str, baud: int, key: str) -> Callable[[], Wire]:

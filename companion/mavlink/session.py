@@ -12,7 +12,7 @@ from companion.mavlink.announcer import Announcer
 from companion.mavlink.contact import AutopilotContact, Watch
 from companion.mavlink.endpoint import Endpoint
 from companion.mavlink.gate import Decision, SendGate
-from companion.mavlink.link import GROUND, NAME, is_network
+from companion.mavlink.link import GROUND, NAME, capacity
 from companion.mavlink.parameters import Parameter, ParameterServer, setting_line
 from companion.mavlink.profiles import Profile, profile_of
 from companion.mavlink.ranging import RangingBeacons
@@ -182,7 +182,7 @@ class MavlinkSession:
             self._announcer.say(mavlink2.MAV_SEVERITY_WARNING, text)
         for message in self._announcer.poll(health, decision, now_ns):
             self._send_all(message)
-        for message in self._parameters.poll(self.capacity(self._lists_to), max(dt, 0.0)):
+        for message in self._parameters.poll(self._capacity(self._lists_to), max(dt, 0.0)):
             self._send(self._lists_to, message)
 
     def take(self) -> dict[str, bytes]:
@@ -195,11 +195,10 @@ class MavlinkSession:
         changes, self._changes = self._changes, []
         return changes
 
-    def capacity(self, name: str) -> float:
-        """Bytes a second that a link carries: ten bits a byte on a serial line."""
+    def _capacity(self, name: str) -> float:
         table = self.config.mavlink
         url = table.url if name == NAME else table.ground_url
-        return NETWORK_CAPACITY if is_network(url) else table.baud / 10.0
+        return capacity(url, table.baud) or NETWORK_CAPACITY
 
     @property
     def _system(self) -> int:

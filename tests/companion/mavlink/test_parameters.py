@@ -128,7 +128,7 @@ def test_a_bad_write_is_answered_with_the_old_value(name: str, bad: float, old: 
 
 
 def test_a_packed_integer_is_refused_not_misread() -> None:
-    assert Pilot().set("OUT_HEIGHT", 1.4e-45, mavlink2.MAV_PARAM_TYPE_INT32) == 0.0
+    assert Pilot().set("HLT_SIGMA_XY", 2.0, mavlink2.MAV_PARAM_TYPE_INT32) == 0.5
 
 
 def test_a_write_to_somebody_else_is_none_of_ours() -> None:
