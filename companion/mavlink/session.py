@@ -75,6 +75,10 @@ class MavlinkSession:
         self._announcer = Announcer()
         self._parameters = ParameterServer(config, self._parameter_set, self._begin_alignment)
         self._lists_to = NAME
+        urls = {NAME: table.url, GROUND: table.ground_url}
+        self._capacities = {
+            name: capacity(urls[name], table.baud) or NETWORK_CAPACITY for name in self.endpoints
+        }
         self._beacons = RangingBeacons(config) if table.raw_ranges else None
         self._obstacles_ns: int | None = None
         self._alignment = CompassAlignment()
@@ -182,7 +186,7 @@ class MavlinkSession:
             self._announcer.say(mavlink2.MAV_SEVERITY_WARNING, text)
         for message in self._announcer.poll(health, decision, now_ns):
             self._send_all(message)
-        for message in self._parameters.poll(self._capacity(self._lists_to), max(dt, 0.0)):
+        for message in self._parameters.poll(self._capacities[self._lists_to], max(dt, 0.0)):
             self._send(self._lists_to, message)
 
     def take(self) -> dict[str, bytes]:
@@ -194,11 +198,6 @@ class MavlinkSession:
         """Parameters that were set since the last call, each with the configuration that it leads to."""
         changes, self._changes = self._changes, []
         return changes
-
-    def _capacity(self, name: str) -> float:
-        table = self.config.mavlink
-        url = table.url if name == NAME else table.ground_url
-        return capacity(url, table.baud) or NETWORK_CAPACITY
 
     @property
     def _system(self) -> int:
