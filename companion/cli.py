@@ -26,10 +26,14 @@ from companion.config import default_toml, load_config, params_dir
 from companion.doctor import app as doctor
 from companion.errors import UserError
 from companion.evaluate_cli import app as evaluate_app
+from companion.params_cli import app as params_app
+from companion.sitl_cli import sitl
 from companion.smooth_cli import smooth
 
 if TYPE_CHECKING:
+    from companion.config import Config
     from companion.live import LiveRun, LiveStatus
+    from companion.log import Log
     from companion.sim.scenario import Scenario
 
 EXIT_BAD_INPUT = 2
@@ -55,6 +59,8 @@ app = typer.Typer(
     add_completion=False,
 )
 app.add_typer(doctor, name="doctor")
+app.add_typer(params_app, name="params")
+app.command()(sitl)
 app.add_typer(evaluate_app, name="evaluate", cls=_ScenarioUnlessNamed)
 app.command()(smooth)
 out = Console(emoji=False)
@@ -141,7 +147,7 @@ def run(
         typer.Option(
             "--mavlink",
             metavar="URL",
-            help="pymavlink device string of the autopilot, e.g. /dev/ttyAMA0 or udpout:host:14550.",
+            help="Device string of the autopilot, /dev/ttyAMA0,921600 or udpout:host:14550 or tcp:host:5760.",
         ),
     ] = None,
     sets: Sets = None,
@@ -152,9 +158,13 @@ def run(
     sent while its health is ok or degraded.
     """
     from companion.live import LiveRun
+    from companion.mavlink.parameters import saved_settings
 
     assignments = [*(sets or []), *([f"mavlink.url={mavlink}"] if mavlink is not None else [])]
     config = load_config(_named(site, "sites"), assignments)
+    if config.mavlink.parameter_file:
+        saved = saved_settings(Path(config.mavlink.parameter_file))
+        config = load_config(_named(site, "sites"), [*saved, *assignments])
     folder = folder or Path("out") / datetime.now().astimezone().strftime("run-%Y%m%d-%H%M%S")
     begin = time.monotonic()
 
@@ -235,6 +245,14 @@ def replay(
         Path | None,
         typer.Option("--site", metavar="FILE", help="Site file instead of the log's own settings."),
     ] = None,
+    mavlink: Annotated[
+        str | None,
+        typer.Option("--mavlink", metavar="URL", help="Send the poses to an autopilot, in real time."),
+    ] = None,
+    speed: Annotated[
+        float,
+        typer.Option("--speed", min=0.1, max=10.0, metavar="X", help="With --mavlink: X times as fast."),
+    ] = 1.0,
     sets: Sets = None,
 ) -> None:
     """Run a log through the very same decoders and estimators as live, without sleeping.
@@ -251,11 +269,16 @@ def replay(
     from estimators import ESTIMATORS
 
     opened = Log(log)
+    if mavlink is not None:
+        sets = [*(sets or []), f"mavlink.url={mavlink}"]
     config = load_config(_named(site, "sites"), sets or []) if site else config_of(opened, sets or [])
     names = list(dict.fromkeys(estimator or [config.pipeline.estimator]))
     for name in names:
         if name not in ESTIMATORS:
             raise UserError(f"--estimator: unknown estimator {name!r}, there are: {', '.join(ESTIMATORS)}")
+    if mavlink is not None:
+        _play(opened, config, names[0], speed)
+        return
     folder = folder or Path("out") / log.stem
     view = RerunView(config, names[0], folder / "replay.rrd")
     begin = time.perf_counter()
@@ -447,6 +470,17 @@ def _progress() -> Iterator[Progress]:
         disable=not err.is_terminal,
     ) as progress:
         yield progress
+
+
+def _play(log: "Log", config: "Config", primary: str, speed: float) -> None:
+    """Send a log's poses to an autopilot and print how well it followed."""
+    from companion.replay_out import Player
+
+    player = Player(log, config, primary, speed, lambda line: err.print(line, markup=False, soft_wrap=True))
+    player.play()
+    out.print(f"{player.poses_sent} poses sent", highlight=False)
+    for line in player.score.lines():
+        out.print(line, highlight=False, markup=False, soft_wrap=True)
 
 
 def _stop_on_signal(stop: threading.Event) -> None:

@@ -13,12 +13,14 @@ from pydantic import (
     ConfigDict,
     Field,
     ValidationError,
+    ValidationInfo,
     create_model,
     field_validator,
     model_validator,
 )
 
 from companion.errors import UserError
+from companion.mavlink_table import MavlinkTable
 from drivers import SENSORS, sensor_config_class
 from drivers.errors import PortError
 from drivers.port import parse_address
@@ -42,6 +44,14 @@ class Table(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
+class OriginTable(Table):
+    """Where on Earth the map's origin is: an autopilot without GPS takes it from here."""
+
+    lat: float = Field(ge=-90, le=90, description="latitude, WGS 84, north is positive [deg]")
+    lon: float = Field(ge=-180, le=180, description="longitude, WGS 84, east is positive [deg]")
+    alt: float = Field(0.0, ge=-1000, le=10_000, description="above mean sea level [m]")
+
+
 class SiteTable(Table):
     """The place."""
 
@@ -54,6 +64,7 @@ class SiteTable(Table):
         description="polylines of walls, for views and for particle filters with scan_likelihood, which hold "
         "scans against them [m]",
     )
+    origin: OriginTable | None = Field(None, description="where the map's origin is on Earth")
 
 
 class BodyTable(Table):
@@ -166,6 +177,9 @@ class HealthTable(Table):
     max_increment_age: float = Field(
         1.0, gt=0, le=60, description="degraded when no LiDAR increment was accepted for so long [s]"
     )
+    max_dead_reckoning: float = Field(
+        20.0, gt=0, le=3600, description="lost when no range was accepted for so long, whatever the sigma [s]"
+    )
     min_accepted_share: float = Field(
         0.3, ge=0, le=0.6, description="lost when a smaller share of recent ranges agrees with the pose"
     )
@@ -176,17 +190,6 @@ class HealthTable(Table):
         description="lost when a larger share of recent ranges is gated as too short: what blocks a range "
         "only lengthens it, so the pose must be wrong",
     )
-
-
-class MavlinkTable(Table):
-    """The link to the autopilot."""
-
-    url: str = Field("udpout:127.0.0.1:14550", description="pymavlink device string, or empty for none")
-    baud: int = Field(921600, ge=1200, le=4_000_000, description="baud of a serial link")
-    system_id: int = Field(
-        1, ge=1, le=255, description="system id until the autopilot's own HEARTBEAT is heard"
-    )
-    component_id: int = Field(197, ge=1, le=255, description="197 is MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY")
 
 
 class Config(Table):
@@ -215,6 +218,22 @@ class Config(Table):
         except AnchorGeometryError as error:
             raise ValueError(str(error)) from error
         return anchors
+
+    @field_validator("mavlink")
+    @classmethod
+    def _fits_the_site(cls, mavlink: MavlinkTable, info: ValidationInfo) -> MavlinkTable:
+        origin = info.data["site"].origin if "site" in info.data else None
+        if mavlink.raw_ranges and (origin is None or mavlink.align != "site"):
+            raise ValueError(
+                'raw_ranges give anchors by latitude and longitude: set site.origin, align = "site"'
+            )
+        has_lidar = any(table.driver == "rplidar" for table in info.data.get("sensor", {}).values())
+        if has_lidar and (mavlink.inputs.odometry or mavlink.inputs.wheels):
+            raise ValueError(
+                "increments of a LiDAR and of the autopilot's link cannot be chained: set inputs.odometry "
+                "and inputs.wheels to 0, or leave the LiDAR out of the site"
+            )
+        return mavlink
 
     @field_validator("estimator")
     @classmethod

@@ -7,13 +7,17 @@ replay of the log asks for exactly the poses that the live run gave.
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Protocol
 
-from companion.config import Config
+from companion.config import Config, HealthTable
 from companion.health import AnchorState, Health, HealthMonitor
 from companion.log import Direction, RawChunk
+from companion.mavlink.link import NAME as MAVLINK
+from companion.mavlink.signing import read_key
 from companion.sequencer import Sequencer
 from drivers import make_sensor
+from drivers.autopilot import Autopilot
 from drivers.framing import Sensor
 from estimators import make_estimator
 from estimators.base import Estimator, Report
@@ -26,6 +30,14 @@ class FrontEnd(Protocol):
 
     def update(self, measurement: Measurement) -> PoseIncrement | None:
         """Increment up to the time of the measurement; None when it gives none."""
+        ...
+
+
+class Decoder(Protocol):
+    """Turns bytes into measurements."""
+
+    def feed(self, data: bytes, stamp_ns: int) -> list[Measurement]:
+        """Decode bytes that arrived at `stamp_ns`; never raises on any bytes."""
         ...
 
 
@@ -96,11 +108,19 @@ class Chain:
 
     def __init__(self, config: Config, start_ns: int, pipeline: Pipeline, primary: str) -> None:
         self.sensors = make_sensors(config)
+        self._decoders: dict[str, Decoder] = {**self.sensors, **make_autopilot_input(config)}
         self.sequencer = Sequencer(round(config.pipeline.hold_ms * 1e6))
         self._pipeline = pipeline
         self._primary = primary
         measured = {kind for sensor in self.sensors.values() for kind in sensor.MEASURES}
-        self._monitor = HealthMonitor(config.health, RangeFrame in measured, Scan in measured, config.anchors)
+        inputs = config.mavlink.inputs
+        self._monitor = HealthMonitor(
+            config.health,
+            RangeFrame in measured,
+            Scan in measured or bool(inputs.odometry or inputs.wheels),
+            config.anchors,
+            config.mavlink.heading,
+        )
         self._start_ns = start_ns
         self._period_ns = 1e9 / config.pipeline.rate
         self._ticks = 0
@@ -117,10 +137,14 @@ class Chain:
     def feed(self, chunk: RawChunk) -> Iterator[Tick]:
         """Give the ticks that were due before these bytes arrived, then decode the bytes."""
         yield from self.advance(chunk.stamp_ns)
-        sensor = self.sensors.get(chunk.source)
-        if sensor is not None and chunk.direction is Direction.IN:
-            for measurement in sensor.feed(chunk.data, chunk.stamp_ns):
+        decoder = self._decoders.get(chunk.source)
+        if decoder is not None and chunk.direction is Direction.IN:
+            for measurement in decoder.feed(chunk.data, chunk.stamp_ns):
                 self.sequencer.push(measurement)
+
+    def set_health(self, table: HealthTable) -> None:
+        """Judge by other limits from now on; the poses do not change with them."""
+        self._monitor.set_table(table)
 
     def advance(self, now_ns: int) -> Iterator[Tick]:
         """Give every tick that is due at `now_ns`."""
@@ -141,6 +165,14 @@ class Chain:
 def make_sensors(config: Config) -> dict[str, Sensor]:
     """A driver for every sensor of the site, by its name."""
     return {name: make_sensor(table.driver, table.settings) for name, table in config.sensor.items()}
+
+
+def make_autopilot_input(config: Config) -> dict[str, Decoder]:
+    """Decoder of what the autopilot measures, by the name of its link; none when nothing of it is used."""
+    inputs, key = config.mavlink.inputs, config.mavlink.signing_key
+    if not any((inputs.attitude, inputs.imu, inputs.height, inputs.odometry, inputs.wheels)):
+        return {}
+    return {MAVLINK: Autopilot(inputs, config.mavlink.autopilot_id, read_key(Path(key)) if key else None)}
 
 
 def make_parts(config: Config, names: list[str]) -> tuple[FrontEnd, dict[str, Estimator]]:

@@ -131,9 +131,12 @@ BAD_INPUT = {
     ),
     "wrong link": (
         ["run", "--site", "demo_room", "--mavlink", "udpout:nonsense"],
-        "mavlink.url: 'udpout:nonsense' is no pymavlink device string",
+        "mavlink.url: 'udpout:nonsense' is no device string",
     ),
-    "link is a file": (["run", "--site", "demo_room", "--mavlink", "text.mcap"], "text.mcap is a file"),
+    "link is a file": (
+        ["run", "--site", "demo_room", "--mavlink", "text.mcap"],
+        "'text.mcap' is no device string: it is a file",
+    ),
     "unknown scenario": (
         ["emulate", "moon"],
         "no file moon and none of that name in params/scenarios; there are: hostile_room, huang2024, ",
