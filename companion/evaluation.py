@@ -5,26 +5,26 @@ of their own; how many there are changes no figure but the times.
 """
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
 from functools import partial
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.stats import chi2
 
 from companion.config import Config
 from companion.errors import UserError
 from companion.estimator_choice import chosen_settings, split_choice
+from companion.evaluate import Errors
+from companion.log_trial import LOG_SUFFIX, log_config, run_log_trial
+from companion.metrics import Alignment, chi2_mean_bounds
 from companion.sim.scenario import load_scenario
 from companion.sim.scenario_tables import PaperTable
 from companion.trial import LIDAR_ALONE, UWB_ALONE, TrialFigures, run_trial
+from companion.trial_runner import run_trials
 from estimators import ESTIMATORS
 
 DEFAULT_CHOICES = (UWB_ALONE, LIDAR_ALONE, "ekf")
-NEES_CONFIDENCE = 0.95
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,6 +43,9 @@ class MeanFigures:
         nees_bounds: the mean NEES of an honest covariance lies between these with 95 % probability. The
             samples of a trial follow each other too closely to be independent: each trial counts as one
             sample, which makes the bounds too wide rather than too narrow.
+        nis_bounds: the same of `nis`; innovations of a consistent filter are independent, so each counts.
+        first_fix_s: None when some trial never gave a pose that would be sent.
+        integrity: of the trials that gave such poses; None when none did.
     """
 
     rmse_m: float
@@ -57,6 +60,14 @@ class MeanFigures:
     nees_bounds: tuple[float, float]
     update_us: UpdateTime
     bound_ratio: float | None
+    ate_m: float
+    rpe_m: float | None
+    rpe_deg: float | None
+    nis: float | None
+    nis_bounds: tuple[float, float] | None
+    availability: float
+    first_fix_s: float | None
+    integrity: float | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,6 +80,10 @@ class Evaluation:
         estimators: choice -> mean figures; None when it gave no pose at all in some trial.
         availability: choice -> share of the instants at which it gave a pose.
         paper: published figures of the scenario.
+        alignment: of the tracks, for `MeanFigures.ate_m`.
+        seeds: of the trials.
+        errors: choice -> errors of every trial in which it gave a pose, by seed.
+        interrupted: whether trials are missing because the user ended them.
     """
 
     scenario: str
@@ -76,11 +91,20 @@ class Evaluation:
     estimators: dict[str, MeanFigures | None]
     availability: dict[str, float]
     paper: PaperTable | None
+    alignment: Alignment
+    seeds: list[int]
+    errors: dict[str, dict[int, Errors]]
+    interrupted: bool
 
     def to_json(self) -> dict[str, Any]:
         """The figures as plain data, in the layout that other programs rely on."""
         figures = {name: asdict(mean) if mean else None for name, mean in self.estimators.items()}
-        return {"scenario": self.scenario, "trials": self.trials, "estimators": figures}
+        return {
+            "scenario": self.scenario,
+            "trials": self.trials,
+            "estimators": figures,
+            "alignment": self.alignment,
+        }
 
 
 def evaluate_scenario(
@@ -91,37 +115,69 @@ def evaluate_scenario(
     sets: Sequence[str] = (),
     workers: int = 1,
     on_trial: Callable[[], None] = lambda: None,
+    alignment: Alignment = Alignment.NONE,
+    scheduler: str | None = None,
 ) -> Evaluation:
-    """Run a scenario many times.
+    """Run a scenario many times, or a log once.
 
     Args:
-        path: scenario file.
-        trials: number of runs.
+        path: scenario file, or log with truth.
+        trials: number of runs of a scenario.
         seed: of the first; None for the scenario's own.
         choices: estimators NAME[:PARAM], `uwb_ls` (ranges alone) and `lidar` (increments alone).
         sets: `--set` assignments on the site's configuration.
         workers: processes to share the trials among; 1 runs them here.
         on_trial: called after each.
+        alignment: of the tracks, for `MeanFigures.ate_m`.
+        scheduler: address of a Dask scheduler, instead of processes here.
 
     Raises:
-        UserError: a file, an assignment or a choice is wrong.
+        UserError: a file, an assignment, a choice or the address is wrong; or no trial was done before the
+            user ended it.
     """
-    scenario = load_scenario(path, seed, list(sets))
     names = list(dict.fromkeys(choices))
+    if path.suffix == LOG_SUFFIX:
+        config, name, paper, seeds = log_config(path, sets), path.stem, None, range(1)
+        trial: Trial = partial(run_log_trial, path, sets=list(sets), choices=names, alignment=alignment)
+    else:
+        scenario = load_scenario(path, seed, list(sets))
+        config, name, paper = scenario.config, scenario.name, scenario.file.paper
+        seeds = range(scenario.seed, scenario.seed + trials)
+        trial = partial(run_trial, path, sets=list(sets), choices=names, alignment=alignment)
     for choice in names:
-        _check(choice, scenario.config)
-    trial = partial(run_trial, path, sets=list(sets), choices=names)
-    results = _run_all(trial, range(scenario.seed, scenario.seed + trials), workers, on_trial)
-    by_name = {name: [result[name] for result in results] for name in names}
+        _check(choice, config)
+    done = run_trials(trial, seeds, workers, scheduler, on_trial)
+    if not done:
+        raise UserError("interrupted before the first trial was done")
+    return summarised(name, done, names, paper, alignment, len(done) < len(seeds))
+
+
+def summarised(
+    scenario: str,
+    done: dict[int, dict[str, TrialFigures | None]],
+    names: Sequence[str],
+    paper: PaperTable | None,
+    alignment: Alignment,
+    interrupted: bool,
+) -> Evaluation:
+    """Means of what trials gave, by seed and choice; see `Evaluation`."""
+    by_name = {name: [result[name] for result in done.values()] for name in names}
     return Evaluation(
-        scenario=scenario.name,
-        trials=trials,
+        scenario=scenario,
+        trials=len(done),
         estimators={name: _mean(figures) for name, figures in by_name.items()},
         availability={
             name: float(np.mean([f.availability if f else 0.0 for f in figures]))
             for name, figures in by_name.items()
         },
-        paper=scenario.file.paper,
+        paper=paper,
+        alignment=alignment,
+        seeds=list(done),
+        errors={
+            name: {seed: f.errors for seed, f in zip(done, figures, strict=True) if f}
+            for name, figures in by_name.items()
+        },
+        interrupted=interrupted,
     )
 
 
@@ -139,29 +195,6 @@ def _check(choice: str, config: Config) -> None:
 Trial = Callable[[int], dict[str, TrialFigures | None]]
 
 
-def _run_all(
-    trial: Trial, seeds: range, workers: int, on_trial: Callable[[], None]
-) -> list[dict[str, TrialFigures | None]]:
-    """Results in the order of the seeds."""
-    if workers == 1:
-        results = []
-        for seed in seeds:
-            results.append(trial(seed))
-            on_trial()
-        return results
-    # Spawned, not forked: this process has threads, of the progress display for one.
-    with ProcessPoolExecutor(min(workers, len(seeds)), get_context("spawn")) as pool:
-        futures = [pool.submit(trial, seed) for seed in seeds]
-        try:
-            for future in as_completed(futures):
-                future.result()
-                on_trial()
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
-        return [future.result() for future in futures]
-
-
 def _mean(results: list[TrialFigures | None]) -> MeanFigures | None:
     figures = [result for result in results if result is not None]
     if len(figures) < len(results):
@@ -174,27 +207,32 @@ def _mean(results: list[TrialFigures | None]) -> MeanFigures | None:
         return None if any(getattr(each, name) is None for each in figures) else mean(name)
 
     median, p99 = np.mean([each.update_us for each in figures], axis=0).tolist()
+    nis_count = sum(each.nis_count for each in figures)
+    integrities = [each.integrity for each in figures if each.integrity is not None]
     return MeanFigures(
         **{name: mean(name) for name in _ALWAYS_KNOWN},
         yaw_rmse_deg=mean_if_known("yaw_rmse_deg"),
-        nees_bounds=nees_bounds([each.nees_dof for each in figures]),
+        nees_bounds=chi2_mean_bounds([each.nees_dof for each in figures]),
         update_us=UpdateTime(median, p99),
         bound_ratio=mean_if_known("bound_ratio"),
+        rpe_m=mean_if_known("rpe_m"),
+        rpe_deg=mean_if_known("rpe_deg"),
+        nis=mean_if_known("nis"),
+        nis_bounds=chi2_mean_bounds([1] * nis_count) if nis_count else None,
+        first_fix_s=mean_if_known("first_fix_s"),
+        integrity=float(np.mean(integrities)) if integrities else None,
     )
 
 
-_ALWAYS_KNOWN = ("rmse_m", "rmse_x_m", "rmse_y_m", "max_m", "max_x_m", "max_y_m", "p95_m", "nees")
-
-
-def nees_bounds(dofs: Sequence[int]) -> tuple[float, float]:
-    """Two-sided bounds on a mean of independent NEES.
-
-    Args:
-        dofs: degrees of freedom of each, the expectation of its NEES.
-
-    Source: Bar-Shalom et al., Estimation with Applications to Tracking and Navigation, 5.4.2: the sum of
-    independent NEES is chi-square with the sum of their degrees of freedom.
-    """
-    tail = (1.0 - NEES_CONFIDENCE) / 2.0
-    law = chi2(sum(dofs))
-    return float(law.ppf(tail)) / len(dofs), float(law.ppf(1.0 - tail)) / len(dofs)
+_ALWAYS_KNOWN = (
+    "rmse_m",
+    "rmse_x_m",
+    "rmse_y_m",
+    "max_m",
+    "max_x_m",
+    "max_y_m",
+    "p95_m",
+    "nees",
+    "ate_m",
+    "availability",
+)

@@ -1,25 +1,28 @@
 """One trial of a scenario: estimators side by side on the same measurements, and how far each was off."""
 
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from companion.config import Config
 from companion.estimator_choice import chosen_settings, split_choice
 from companion.evaluate import Errors, Reference, compare
+from companion.health import HealthMonitor
 from companion.log import Truth
-from companion.pipeline import Chain, Pipeline
+from companion.metrics import Alignment, integrity_violations, relative_errors, trajectory_error
+from companion.pipeline import Chain, Pipeline, make_sensors
 from companion.sim.measurements import MeasuredWalk, measure, setup_of
 from companion.sim.scenario import Scenario, load_scenario
 from companion.sim.simulate import START_NS, converse
+from companion.watched import WatchedEstimator
 from estimators import make_estimator
-from estimators.base import Estimator, Report, Setup, Verdict
+from estimators.base import Estimator, Setup
 from estimators.bounds import landmark_information, posterior_bound, range_information
 from estimators.lidar.dead_reckoning import DeadReckoning
 from estimators.lidar.scan_matching import ScanMatcher
-from estimators.messages import Measurement, PoseEstimate
+from estimators.messages import FloatArray, PoseEstimate, RangeFrame, Scan
 
 UWB_ALONE, LIDAR_ALONE = "uwb_ls", "lidar"
 """The single sensors: `least_squares` on ranges alone; increments added up from the true start."""
@@ -39,6 +42,15 @@ class TrialFigures:
         availability: share of the instants at which there was a pose.
         update_us: median and 99th percentile of the time of an update that was used [us].
         bound_ratio: `rmse_m` over the posterior Cramer-Rao bound; None when that is not known.
+        ate_m: `rmse_m` after the alignment that was asked for.
+        rpe_m: root mean square of the position error that grows over a metre of the way; None without
+            heading, or on a shorter way.
+        rpe_deg: the same of the heading.
+        nis: mean NIS of the ranges that were accepted; None when there are none.
+        nis_count: how many they are.
+        first_fix_s: time from the first instant to the first pose that a live run would send; None without.
+        integrity: share of the poses that would be sent whose error is beyond 3 sigma; None without any.
+        errors: at every instant.
     """
 
     rmse_m: float
@@ -54,10 +66,18 @@ class TrialFigures:
     availability: float
     update_us: tuple[float, float]
     bound_ratio: float | None
+    ate_m: float
+    rpe_m: float | None
+    rpe_deg: float | None
+    nis: float | None
+    nis_count: int
+    first_fix_s: float | None
+    integrity: float | None
+    errors: Errors
 
 
 def run_trial(
-    path: Path, seed: int, sets: list[str], choices: Sequence[str]
+    path: Path, seed: int, sets: list[str], choices: Sequence[str], alignment: Alignment = Alignment.NONE
 ) -> dict[str, TrialFigures | None]:
     """Run a scenario once.
 
@@ -66,6 +86,7 @@ def run_trial(
         seed: of everything random.
         sets: `--set` assignments on the site's configuration.
         choices: NAME[:PARAM] of estimators, or single sensors.
+        alignment: of tracks, for `TrialFigures.ate_m`.
 
     Returns:
         Figures by choice; None for an estimator that gave no pose at all.
@@ -75,52 +96,55 @@ def run_trial(
     """
     scenario = load_scenario(path, seed, sets)
     setup = setup_of(scenario)
-    timed = {choice: _TimedEstimator(_make(scenario, setup, choice)) for choice in choices}
+    start = scenario.trajectory.at(np.zeros(1)).pose[0]
+    watched = {
+        choice: WatchedEstimator(
+            make_choice(scenario.config, setup, choice, start), monitor_of(scenario.config)
+        )
+        for choice in choices
+    }
     poses: dict[str, list[PoseEstimate]] = {choice: [] for choice in choices}
     bound: float | None = None
     if scenario.file.increments is not None:
         walk = measure(scenario)
         bound = _bound(scenario, setup, walk)
-        truths, instants = _step_through(walk, timed, poses)
+        truths, instants = _step_through(walk, watched, poses)
     else:
-        truths, instants = _run_chain(scenario, timed, poses)
+        truths, instants = _run_chain(scenario, watched, poses)
     reference = Reference(truths)
     covered = sum(reference.covers(stamp_ns) for stamp_ns in instants)
     return {
-        choice: _figures(compare(poses[choice], reference, covered), timed[choice].seconds, bound)
+        choice: trial_figures(
+            compare(poses[choice], reference, covered), watched[choice], instants[0], bound, alignment
+        )
         for choice in choices
     }
 
 
-class _TimedEstimator:
-    """An estimator that notes how long each update took that it had a use for."""
+def make_choice(config: Config, setup: Setup, choice: str, start: FloatArray) -> Estimator:
+    """Estimator or single sensor that a choice names.
 
-    def __init__(self, estimator: Estimator) -> None:
-        self._estimator = estimator
-        self.seconds: list[float] = []
+    Args:
+        config: of the site.
+        setup: its geometry.
+        choice: NAME[:PARAM].
+        start: (3,) true x [m], y [m], yaw [rad] at the start, from which `lidar` counts.
 
-    def reset(self) -> None:
-        self._estimator.reset()
-
-    def update(self, measurement: Measurement) -> Report:
-        begin = time.perf_counter()
-        report = self._estimator.update(measurement)
-        took = time.perf_counter() - begin
-        if Verdict.NOT_USED not in report.verdicts:
-            self.seconds.append(took)
-        return report
-
-    def pose_at(self, stamp_ns: int) -> PoseEstimate | None:
-        return self._estimator.pose_at(stamp_ns)
-
-
-def _make(scenario: Scenario, setup: Setup, choice: str) -> Estimator:
+    Raises:
+        UserError: the parameter is wrong.
+    """
     if choice == LIDAR_ALONE:
-        return DeadReckoning(setup, scenario.trajectory.at(np.zeros(1)).pose[0])
+        return DeadReckoning(setup, start)
     if choice == UWB_ALONE:
         choice = "least_squares"
-    settings = chosen_settings(scenario.config, choice, "--estimators")
+    settings = chosen_settings(config, choice, "--estimators")
     return make_estimator(split_choice(choice)[0], settings, setup)
+
+
+def monitor_of(config: Config) -> HealthMonitor:
+    """What judges the pose of an estimator as a live run of this site would."""
+    measured = {kind for sensor in make_sensors(config).values() for kind in sensor.MEASURES}
+    return HealthMonitor(config.health, RangeFrame in measured, Scan in measured)
 
 
 def _step_through(
@@ -190,14 +214,28 @@ def _bound(scenario: Scenario, setup: Setup, walk: MeasuredWalk) -> float | None
     return float(np.sqrt((bounds[:, 0, 0] + bounds[:, 1, 1]).mean()))
 
 
-def _figures(errors: Errors, seconds: list[float], bound: float | None) -> TrialFigures | None:
+def trial_figures(
+    errors: Errors, watched: WatchedEstimator, begin_ns: int, bound: float | None, alignment: Alignment
+) -> TrialFigures | None:
+    """Figures of one estimator in one trial; None when it gave no pose where truth is known.
+
+    Args:
+        errors: of its poses.
+        watched: the estimator, after the trial.
+        begin_ns: first instant at which a pose was asked for.
+        bound: least position error that any estimator can have, root mean square [m]; None when not known.
+        alignment: of the track, for `TrialFigures.ate_m`.
+    """
     accuracy = errors.accuracy()
     if accuracy is None:
         return None
     by_axis = np.abs(errors.error[:, :2])
     rmse_x, rmse_y = np.sqrt((by_axis**2).mean(axis=0)).tolist()
     max_x, max_y = by_axis.max(axis=0).tolist()
-    median, p99 = (1e6 * np.percentile(seconds, [50, 99])).tolist()
+    median, p99 = (1e6 * np.percentile(watched.seconds, [50, 99])).tolist()
+    drift = relative_errors(errors) if errors.has_yaw else np.empty((0, 3))
+    rpe = np.sqrt((drift**2).mean(axis=0)).tolist() if len(drift) else None
+    healthy_ns = watched.healthy_ns
     return TrialFigures(
         rmse_m=accuracy.rmse,
         rmse_x_m=rmse_x,
@@ -212,4 +250,12 @@ def _figures(errors: Errors, seconds: list[float], bound: float | None) -> Trial
         availability=accuracy.availability,
         update_us=(median, p99),
         bound_ratio=accuracy.rmse / bound if bound is not None else None,
+        ate_m=trajectory_error(errors, alignment),
+        rpe_m=float(np.hypot(rpe[0], rpe[1])) if rpe else None,
+        rpe_deg=float(np.rad2deg(rpe[2])) if rpe else None,
+        nis=float(np.mean(watched.nis)) if watched.nis else None,
+        nis_count=len(watched.nis),
+        first_fix_s=(healthy_ns[0] - begin_ns) * 1e-9 if healthy_ns else None,
+        integrity=integrity_violations(errors, healthy_ns),
+        errors=errors,
     )
