@@ -1,8 +1,6 @@
 """The commands. Data goes to files or stdout, progress and messages to stderr."""
 
-import json
 import logging
-import os
 import signal
 import sys
 import threading
@@ -22,7 +20,7 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 from typer.core import TyperGroup
 
 from companion import __version__
-from companion.config import default_toml, load_config, params_dir
+from companion.config import default_toml, load_config, named_file
 from companion.doctor import app as doctor
 from companion.errors import UserError
 from companion.evaluate_cli import app as evaluate_app
@@ -151,7 +149,7 @@ def run(
     from companion.live import LiveRun
 
     assignments = [*(sets or []), *([f"mavlink.url={mavlink}"] if mavlink is not None else [])]
-    config = load_config(_named(site, "sites"), assignments)
+    config = load_config(named_file(site, "sites"), assignments)
     folder = folder or Path("out") / datetime.now().astimezone().strftime("run-%Y%m%d-%H%M%S")
     begin = time.monotonic()
 
@@ -248,7 +246,7 @@ def replay(
     from estimators import ESTIMATORS
 
     opened = Log(log)
-    config = load_config(_named(site, "sites"), sets or []) if site else config_of(opened, sets or [])
+    config = load_config(named_file(site, "sites"), sets or []) if site else config_of(opened, sets or [])
     names = list(dict.fromkeys(estimator or [config.pipeline.estimator]))
     for name in names:
         if name not in ESTIMATORS:
@@ -274,61 +272,6 @@ def replay(
     out.print(f"  written to {folder}: poses.tum, summary.json, config.toml, replay.rrd", highlight=False)
 
 
-@evaluate_app.command("scenario")
-def evaluate(
-    scenario: Scenario_,
-    trials: Annotated[int, typer.Option("--trials", min=1, metavar="N", help="Number of runs.")] = 30,
-    seed: Seed = None,
-    estimators: Annotated[
-        str | None,
-        typer.Option(
-            "--estimators",
-            metavar="A,B",
-            help="Estimators, NAME or NAME:PARAM; uwb_ls and lidar are the single sensors. "
-            "Default: uwb_ls,lidar,ekf.",
-        ),
-    ] = None,
-    json_file: Annotated[
-        Path | None, typer.Option("--json", metavar="FILE", help="Write the figures there, too.")
-    ] = None,
-    workers: Annotated[
-        int | None, typer.Option("--workers", min=1, metavar="N", help="Processes; default: one a core.")
-    ] = None,
-    sets: Sets = None,
-) -> None:
-    """Measure estimators on many trials of a scenario: errors, consistency, time, distance from the bound.
-
-    The word "scenario" may be left out: [bold]companion evaluate huang2024[/]. Trial k has the seed S + k
-    for everything random: obstacles, start, gait and noise. The same seed gives the same figures, times
-    excepted. Where the scenario holds figures of a paper, they stand below ours.
-    """
-    from companion.evaluation import DEFAULT_CHOICES, evaluate_scenario
-    from companion.evaluation_table import evaluation_notes, evaluation_table
-
-    choices = DEFAULT_CHOICES if estimators is None else estimators.split(",")
-    if json_file is not None and not json_file.parent.is_dir():
-        raise UserError(f"cannot write {json_file}: there is no folder {json_file.parent}")
-    with _progress() as progress:
-        bar = progress.add_task("trials", total=trials)
-        result = evaluate_scenario(
-            _scenario_path(scenario),
-            trials,
-            seed,
-            choices,
-            sets or [],
-            workers or os.cpu_count() or 1,
-            lambda: progress.advance(bar),
-        )
-    out.print(evaluation_table(result))
-    for line in evaluation_notes(result):
-        out.print(f"  {line}", highlight=False, soft_wrap=True)
-    if json_file is not None:
-        try:
-            json_file.write_text(json.dumps(result.to_json(), indent=2) + "\n", encoding="utf-8")
-        except OSError as error:
-            raise UserError(f"cannot write {json_file}: {error.strerror}") from error
-
-
 @app.command("dump-config")
 def dump_config(
     site: Annotated[
@@ -342,7 +285,7 @@ def dump_config(
             raise UserError("--set: give --site too; the defaults alone are no configuration to change")
         sys.stdout.write(default_toml())
     else:
-        sys.stdout.write(load_config(_named(site, "sites"), sets or []).to_toml())
+        sys.stdout.write(load_config(named_file(site, "sites"), sets or []).to_toml())
 
 
 def main() -> NoReturn:
@@ -358,19 +301,8 @@ def main() -> NoReturn:
     sys.exit(0)
 
 
-def _named(path: Path, kind: str) -> Path:
-    """A file of the user's, or one of ours in `params/KIND` by its bare name."""
-    if path.exists() or path.suffix or path.name != str(path):
-        return path
-    ours = params_dir() / kind / f"{path}.toml"
-    if not ours.exists():
-        names = ", ".join(sorted(p.stem for p in ours.parent.glob("*.toml")))
-        raise UserError(f"no file {path} and none of that name in params/{kind}; there are: {names}")
-    return ours
-
-
 def _scenario_path(name: str) -> Path:
-    return _named(Path(name), "scenarios")
+    return named_file(Path(name), "scenarios")
 
 
 def _load_scenario(name: str, seed: int | None, sets: list[str] | None) -> "Scenario":

@@ -84,6 +84,7 @@ class Evaluation:
         seeds: of the trials.
         errors: choice -> errors of every trial in which it gave a pose, by seed.
         interrupted: whether trials are missing because the user ended them.
+        config: of the site.
     """
 
     scenario: str
@@ -95,6 +96,21 @@ class Evaluation:
     seeds: list[int]
     errors: dict[str, dict[int, Errors]]
     interrupted: bool
+    config: Config
+
+    @property
+    def decisive(self) -> str:
+        """The choice whose worst trial is looked at: the site's own estimator, else the last one."""
+        own = self.config.pipeline.estimator
+        return own if own in self.estimators else list(self.estimators)[-1]
+
+    def worst_seed(self) -> int:
+        """Trial in which the decisive choice erred most (RMSE), or gave no pose at all."""
+        errors = self.errors[self.decisive]
+        without = [seed for seed in self.seeds if seed not in errors]
+        if without:
+            return without[0]
+        return max(self.seeds, key=lambda seed: float((errors[seed].distance ** 2).mean()))
 
     def to_json(self) -> dict[str, Any]:
         """The figures as plain data, in the layout that other programs rely on."""
@@ -149,7 +165,7 @@ def evaluate_scenario(
     done = run_trials(trial, seeds, workers, scheduler, on_trial)
     if not done:
         raise UserError("interrupted before the first trial was done")
-    return summarised(name, done, names, paper, alignment, len(done) < len(seeds))
+    return summarised(name, done, names, paper, alignment, len(done) < len(seeds), config)
 
 
 def summarised(
@@ -159,6 +175,7 @@ def summarised(
     paper: PaperTable | None,
     alignment: Alignment,
     interrupted: bool,
+    config: Config,
 ) -> Evaluation:
     """Means of what trials gave, by seed and choice; see `Evaluation`."""
     by_name = {name: [result[name] for result in done.values()] for name in names}
@@ -178,6 +195,7 @@ def summarised(
             for name, figures in by_name.items()
         },
         interrupted=interrupted,
+        config=config,
     )
 
 

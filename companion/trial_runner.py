@@ -89,9 +89,7 @@ def _executor(workers: int, scheduler: str | None) -> Iterator[Executor]:
     try:
         from distributed import Client
     except ImportError as error:
-        raise UserError(
-            "--scheduler needs distributed: pip install companion[cluster]"
-        ) from error
+        raise UserError("--scheduler needs distributed: pip install companion[cluster]") from error
     try:
         client = Client(scheduler, timeout=CONNECT_TIMEOUT)
     except (OSError, ValueError) as error:
