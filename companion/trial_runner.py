@@ -70,10 +70,13 @@ def _results(futures: Iterable[Future[R]]) -> Iterator[R]:
 
 
 def _stop(futures: Iterable[Future[R]]) -> None:
-    for future in futures:
-        future.cancel()
-    for worker in multiprocessing.active_children():
+    """End trials at once: the processes here (whose pool then gives up what waits), or a cluster's queue."""
+    workers = multiprocessing.active_children()
+    for worker in workers:
         worker.terminate()
+    if not workers:
+        for future in futures:
+            future.cancel()
 
 
 @contextmanager
