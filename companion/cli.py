@@ -272,6 +272,35 @@ def replay(
     out.print(f"  written to {folder}: poses.tum, summary.json, config.toml, replay.rrd", highlight=False)
 
 
+@app.command()
+def edit(
+    log: Annotated[Path, typer.Argument(metavar="LOG", help="Log (MCAP) to read.")],
+    fault: Annotated[
+        list[str],
+        typer.Option("--fault", metavar="KIND:KEY=VALUE,...", help="What goes wrong. Repeatable."),
+    ],
+    path: Annotated[Path, typer.Option("--out", metavar="LOG", help="Log (MCAP) to write.")],
+    seed: Seed = None,
+) -> None:
+    """Write a log as it would be had something gone wrong: what if anchor 3 dies at 20 s?
+
+    [bold]companion edit raw.mcap --fault drop:anchor=3,at=20 --out what_if.mcap[/], then replay what_if.mcap.
+    Every fault has at= and for= [s]. silent (sensor), late (sensor, by [s]), drop (anchor), spike (anchor,
+    size [m], share), nlos (anchor, least, mean [m]), moved (anchor, x, y, z [m]; needs truth), clock (by [s]:
+    the tag's clock jumps), rotated (yaw_deg: the tag in its mount), blocked (from_deg, to_deg, distance: a
+    sector of the LiDAR), gone (share of LiDAR beams without return).
+    """
+    from companion.log import Log
+    from companion.log_edit.edit import edit_log
+    from companion.log_edit.faults import parse_fault
+    from companion.replay import config_of
+
+    opened = Log(log)
+    config = config_of(opened, [])
+    edit_log(opened, config, [parse_fault(text, config) for text in fault], seed or 0, path)
+    out.print(f"{path}  replay it with: companion replay {path}", highlight=False, soft_wrap=True)
+
+
 @app.command("dump-config")
 def dump_config(
     site: Annotated[

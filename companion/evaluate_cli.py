@@ -68,6 +68,15 @@ def scenario(
             "the trials. Needs the extra cluster.",
         ),
     ] = None,
+    fault: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--fault",
+            metavar="KIND:KEY=VALUE,...",
+            help="Put a fault into every trial (see companion edit --help); repeat it for several at once. "
+            "library: one evaluation for every sort of fault.",
+        ),
+    ] = None,
     sets: Annotated[
         list[str] | None,
         typer.Option(
@@ -94,9 +103,9 @@ def scenario(
         raise UserError(f"cannot write {json_file}: there is no folder {json_file.parent}")
     paths = [named_file(Path(source), "scenarios") for source in sources]
     results: list[Evaluation] = []
-    for path in paths:
+    for path, faults in _runs(paths, fault or [], sets or []):
         with _progress(err) as progress:
-            count = 1 if path.suffix == LOG_SUFFIX else trials
+            count = 1 if path.suffix == LOG_SUFFIX and not faults else trials
             bar = progress.add_task(path.stem, total=count)
             results.append(
                 evaluate_scenario(
@@ -109,6 +118,7 @@ def scenario(
                     partial(progress.advance, bar),
                     align,
                     scheduler,
+                    faults,
                 )
             )
         result = results[-1]
@@ -117,7 +127,7 @@ def scenario(
         for line in evaluation_notes(result):
             out.print(f"  {line}", highlight=False, soft_wrap=True)
         if folder is not None:
-            for line in _write_report(results, path, folder, sets or []):
+            for line in _write_report(results, path, folder, sets or [], faults):
                 out.print(f"  {line}", highlight=False, soft_wrap=True)
         if result.interrupted:
             err.print(f"[yellow]interrupted: {path} has {result.trials} of {count} trials[/]")
@@ -125,7 +135,7 @@ def scenario(
     if json_file is not None:
         figures = [result.to_json() for result in results]
         try:
-            text = json.dumps(figures[0] if len(sources) == 1 else figures, indent=2)
+            text = json.dumps(figures[0] if len(figures) == 1 else figures, indent=2)
             json_file.write_text(text + "\n", encoding="utf-8")
         except OSError as error:
             raise UserError(f"cannot write {json_file}: {error.strerror}") from error
@@ -133,19 +143,37 @@ def scenario(
         raise typer.Exit(1)
 
 
-def _write_report(results: "list[Evaluation]", path: Path, folder: Path, sets: list[str]) -> list[str]:
+def _runs(paths: list[Path], faults: list[str], sets: list[str]) -> list[tuple[Path, list[str]]]:
+    """What is to be evaluated: source and faults of each evaluation."""
+    from companion.log_edit.faults import library
+    from companion.log_trial import LOG_SUFFIX, log_config
+    from companion.sim.scenario import load_scenario
+
+    if faults != ["library"]:
+        return [(path, faults) for path in paths]
+    runs = []
+    for path in paths:
+        is_log = path.suffix == LOG_SUFFIX
+        config = log_config(path, sets) if is_log else load_scenario(path, None, sets).config
+        runs += [(path, [text]) for text in library(config)]
+    return runs
+
+
+def _write_report(
+    results: "list[Evaluation]", path: Path, folder: Path, sets: list[str], faults: list[str]
+) -> list[str]:
     """Picture, worst trial and Markdown of the newest result, after those before; says what is there."""
     from companion.evaluation_plots import evaluation_figure
     from companion.evaluation_table import markdown
     from companion.worst_trial import write_worst_trial
 
     newest = results[-1]
-    picture = folder / f"{newest.scenario}.png"
+    picture = folder / f"{newest.file_stem}.png"
     evaluation_figure(newest, picture)
-    text = "\n".join(markdown(result, [f"{result.scenario}.png"]) for result in results)
+    text = "\n".join(markdown(result, [f"{result.file_stem}.png"]) for result in results)
     (folder / "report.md").write_text(text, encoding="utf-8")
     lines = [f"report   {folder / 'report.md'}", f"picture  {picture}"]
-    log = write_worst_trial(newest, path, folder, sets)
+    log = write_worst_trial(newest, path, folder, sets, faults)
     if log is not None:
         lines.append(f"worst trial of {newest.decisive}, seed {newest.worst_seed()}: {log}")
         lines.append(f"look at it: companion replay {log}, then rerun out/{log.stem}/replay.rrd")

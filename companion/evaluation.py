@@ -4,6 +4,7 @@ Trial k has seed S + k for everything random in it: obstacles, start, gait and n
 of their own; how many there are changes no figure but the times.
 """
 
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -16,6 +17,8 @@ from companion.config import Config
 from companion.errors import UserError
 from companion.estimator_choice import chosen_settings, split_choice
 from companion.evaluate import Errors
+from companion.fault_trial import run_fault_trial
+from companion.log_edit.faults import parse_fault
 from companion.log_trial import LOG_SUFFIX, log_config, run_log_trial
 from companion.metrics import Alignment, chi2_mean_bounds
 from companion.sim.scenario import load_scenario
@@ -99,6 +102,11 @@ class Evaluation:
     config: Config
 
     @property
+    def file_stem(self) -> str:
+        """The name as part of a file's name."""
+        return re.sub(r"[^\w.=-]+", "_", self.scenario)
+
+    @property
     def decisive(self) -> str:
         """The choice whose worst trial is looked at: the site's own estimator, else the last one."""
         own = self.config.pipeline.estimator
@@ -133,8 +141,9 @@ def evaluate_scenario(
     on_trial: Callable[[], None] = lambda: None,
     alignment: Alignment = Alignment.NONE,
     scheduler: str | None = None,
+    faults: Sequence[str] = (),
 ) -> Evaluation:
-    """Run a scenario many times, or a log once.
+    """Run a scenario many times, or a log once (with faults, many times).
 
     Args:
         path: scenario file, or log with truth.
@@ -146,10 +155,11 @@ def evaluate_scenario(
         on_trial: called after each.
         alignment: of the tracks, for `MeanFigures.ate_m`.
         scheduler: address of a Dask scheduler, instead of processes here.
+        faults: put into every trial, as the command line writes them.
 
     Raises:
-        UserError: a file, an assignment, a choice or the address is wrong; or no trial was done before the
-            user ended it.
+        UserError: a file, a fault, an assignment, a choice or the address is wrong; or no trial was done
+            before the user ended it.
     """
     names = list(dict.fromkeys(choices))
     if path.suffix == LOG_SUFFIX:
@@ -162,6 +172,14 @@ def evaluate_scenario(
         trial = partial(run_trial, path, sets=list(sets), choices=names, alignment=alignment)
     for choice in names:
         _check(choice, config)
+    for fault in faults:
+        parse_fault(fault, config)
+    if faults:
+        first = seeds[0] if seed is None else seed
+        seeds, name = range(first, first + trials), f"{name}, {' '.join(faults)}"
+        trial = partial(
+            run_fault_trial, path, sets=list(sets), choices=names, alignment=alignment, faults=list(faults)
+        )
     done = run_trials(trial, seeds, workers, scheduler, on_trial)
     if not done:
         raise UserError("interrupted before the first trial was done")
