@@ -27,6 +27,8 @@ class ScanEncoder:
     def __init__(self, sample_ns: int, latency_ns: int = 0) -> None:
         self._sample_ns = max(sample_ns, LEAST_SAMPLE_NS)
         self._latency_ns = latency_ns
+        self._newest_ns: int | None = None
+        """Time of the newest beam; None before a stream begins."""
         self._begins = True
         self._waiting: IntArray = np.empty((5, 0), np.int64)
         """angle_q14, distance_q2, quality, starts, time [ns]."""
@@ -34,7 +36,7 @@ class ScanEncoder:
     def add(self, scan: Scan) -> list[tuple[int, bytes]]:
         """Packets that a scan completes: arrival stamp, bytes."""
         out: list[tuple[int, bytes]] = []
-        if self._waiting.shape[1] and scan.stamp_ns - self._waiting[4, -1] > (_PACKET + 1) * self._sample_ns:
+        if self._newest_ns is not None and scan.stamp_ns - self._newest_ns > (_PACKET + 1) * self._sample_ns:
             out += self.flush()
         count = len(scan.angles)
         beams = np.zeros((5, count), np.int64)
@@ -43,20 +45,21 @@ class ScanEncoder:
         beams[2] = np.clip(scan.quality, 0, 255)
         beams[3, 0] = 1
         beams[4] = scan.stamp_ns + np.rint(scan.beam_times * 1e9).astype(np.int64)
+        self._newest_ns = int(beams[4, -1])
         self._waiting = np.hstack((self._waiting, beams))
         return out + self._packets()
 
     def flush(self) -> list[tuple[int, bytes]]:
         """Packets that end the revolution, filled with samples that saw nothing."""
-        if not self._waiting.shape[1]:
+        if self._newest_ns is None:
             return []
         missing = _PACKET - self._waiting.shape[1] % _PACKET
         end = np.zeros((5, missing), np.int64)
         end[3, 0] = 1
-        end[4] = self._waiting[4, -1] + self._sample_ns * np.arange(1, missing + 1)
+        end[4] = self._newest_ns + self._sample_ns * np.arange(1, missing + 1)
         self._waiting = np.hstack((self._waiting, end))
         out = self._packets()
-        self._begins = True
+        self._newest_ns, self._begins = None, True
         return out
 
     def _packets(self) -> list[tuple[int, bytes]]:
