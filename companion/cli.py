@@ -301,6 +301,53 @@ def edit(
     out.print(f"{path}  replay it with: companion replay {path}", highlight=False, soft_wrap=True)
 
 
+@app.command("import")
+def import_recording(
+    source: Annotated[
+        Path,
+        typer.Argument(
+            metavar="SOURCE",
+            help="Folder of a public data set (lias_planar, labyrinth_uwb, robotino_uwb) or of text files as "
+            "export writes them, CARMEN log, ROS 1 or 2 bag.",
+        ),
+    ],
+    path: Annotated[Path, typer.Option("--out", metavar="LOG", help="Log (MCAP) to write.")],
+    site: Annotated[
+        Path | None,
+        typer.Option("--site", metavar="FILE", help="Site file; we have one for each of the data sets."),
+    ] = None,
+    truth: Annotated[
+        str | None,
+        typer.Option("--truth", metavar="TOPIC", help="Odometry or PoseStamped of a bag to compare with."),
+    ] = None,
+    sets: Sets = None,
+) -> None:
+    """Make a log of somebody else's recording, in the bytes that our sensors would have sent.
+
+    Ranges become LinkTrack frames, scans RPLIDAR packets: replay and evaluate take the one path that a
+    robot takes.
+    """
+    from companion.importers.sources import import_log
+
+    count = import_log(source, path, site and named_file(site, "sites"), sets, truth)
+    out.print(f"{path}  {count} measurements", highlight=False, soft_wrap=True)
+
+
+@app.command()
+def export(
+    log: Annotated[Path, typer.Argument(metavar="LOG", help="Log (MCAP).")],
+    folder: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to write.")],
+) -> None:
+    """Write what a log holds as text: ranges.csv, scans.csv, imu.csv, truth.tum."""
+    from companion.importers.text_folder import write_folder
+    from companion.log import Log
+    from companion.replay import config_of
+
+    opened = Log(log)
+    for path in write_folder(opened, config_of(opened, []), folder):
+        out.print(str(path), highlight=False, soft_wrap=True)
+
+
 @app.command("dump-config")
 def dump_config(
     site: Annotated[

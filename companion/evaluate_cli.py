@@ -1,9 +1,12 @@
 """`companion evaluate`: how good the algorithms are, measured."""
 
+import atexit
 import json
 import os
 from functools import partial
 from pathlib import Path
+from shutil import rmtree
+from tempfile import mkdtemp
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -26,7 +29,7 @@ def scenario(
         list[str],
         typer.Argument(
             metavar="SOURCE...",
-            help="Scenario file, name of one in params/scenarios, or log (MCAP) with truth.",
+            help="Scenario file, name of one in params/scenarios, log (MCAP) with truth, data set's folder.",
         ),
     ],
     trials: Annotated[
@@ -101,7 +104,7 @@ def scenario(
         _make_writable(folder / "report.md")
     if json_file is not None and not json_file.parent.is_dir():
         raise UserError(f"cannot write {json_file}: there is no folder {json_file.parent}")
-    paths = [named_file(Path(source), "scenarios") for source in sources]
+    paths = [_imported(named_file(Path(source), "scenarios"), sets or []) for source in sources]
     results: list[Evaluation] = []
     for path, faults in _runs(paths, fault or [], sets or []):
         with _progress(err) as progress:
@@ -141,6 +144,19 @@ def scenario(
             raise UserError(f"cannot write {json_file}: {error.strerror}") from error
     if results[-1].interrupted:
         raise typer.Exit(1)
+
+
+def _imported(path: Path, sets: list[str]) -> Path:
+    """The source itself, or for the folder of a data set the log that is made of it."""
+    if not path.is_dir():
+        return path
+    from companion.importers.sources import import_log
+
+    folder = mkdtemp(prefix="companion-")
+    atexit.register(rmtree, folder)
+    log = Path(folder) / f"{path.name}.mcap"
+    import_log(path, log, sets=sets)
+    return log
 
 
 def _runs(paths: list[Path], faults: list[str], sets: list[str]) -> list[tuple[Path, list[str]]]:

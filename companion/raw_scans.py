@@ -17,15 +17,15 @@ class ScanEncoder:
     """Writes scans as packets of the HQ mode, whose angles and distances have room for any LiDAR.
 
     The decoder takes a revolution as ended when the next one begins. Where the next scan does not follow
-    at once, the end is written explicitly and a new stream begins, whose times owe nothing to those before.
+    at once, the end is written explicitly and a new stream begins, whose times owe nothing to those before
+    and whose beams follow each other as those of its first scan do.
 
     Args:
-        sample_ns: time from one beam to the next.
         latency_ns: by which the driver takes stamps back.
     """
 
-    def __init__(self, sample_ns: int, latency_ns: int = 0) -> None:
-        self._sample_ns = max(sample_ns, LEAST_SAMPLE_NS)
+    def __init__(self, latency_ns: int = 0) -> None:
+        self._sample_ns = LEAST_SAMPLE_NS
         self._latency_ns = latency_ns
         self._newest_ns: int | None = None
         """Time of the newest beam; None before a stream begins."""
@@ -38,6 +38,9 @@ class ScanEncoder:
         out: list[tuple[int, bytes]] = []
         if self._newest_ns is not None and scan.stamp_ns - self._newest_ns > (_PACKET + 1) * self._sample_ns:
             out += self.flush()
+        if self._newest_ns is None:
+            interval = float(np.median(np.diff(scan.beam_times)))
+            self._sample_ns = max(round(interval * 1e9), LEAST_SAMPLE_NS)
         count = len(scan.angles)
         beams = np.zeros((5, count), np.int64)
         beams[0] = _q14(scan.angles)

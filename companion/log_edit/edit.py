@@ -128,8 +128,7 @@ def _with_scans(
     table = config.sensor[source]
     sensor = make_sensor(table.driver, table.settings)
     out = [record for record in records if not _is_from(record, source)]
-    encoder: ScanEncoder | None = None
-    latency_ns = round(table.settings.latency_ms * 1e6)
+    encoder = ScanEncoder(round(table.settings.latency_ms * 1e6))
     packets: list[tuple[int, bytes]] = []
     for record in records:
         if not _is_from(record, source):
@@ -137,22 +136,14 @@ def _with_scans(
         assert isinstance(record, RawChunk)
         for scan in sensor.feed(record.data, record.stamp_ns):
             assert isinstance(scan, Scan)
-            if encoder is None:
-                encoder = ScanEncoder(sample_ns_of(scan), latency_ns)
             changed = scan
             for fault in faults:
                 if fault.active((scan.stamp_ns - start_ns) * 1e-9):
                     changed = fault.edit_scan(changed)
             packets += encoder.add(changed)
-    if encoder is not None:
-        packets += encoder.flush()
+    packets += encoder.flush()
     out += [RawChunk(source, Direction.IN, stamp_ns, data) for stamp_ns, data in packets]
     return out
-
-
-def sample_ns_of(scan: Scan) -> int:
-    """Time from one beam of a scan to the next [ns]."""
-    return round(float(np.median(np.diff(scan.beam_times))) * 1e9)
 
 
 def _with_chunks(records: list[Record], start_ns: int, faults: Sequence[ChunkFault]) -> list[Record]:

@@ -117,7 +117,7 @@ def test_any_scans_are_written_so_that_the_driver_reads_them(
     counts: list[int], sample_ns: int, pause: int, seed: int
 ) -> None:
     rng = np.random.default_rng(seed)
-    encoder, sensor = ScanEncoder(sample_ns), Rplidar(Rplidar.Config())
+    encoder, sensor = ScanEncoder(), Rplidar(Rplidar.Config())
     written: list[Scan] = []
     packets: list[tuple[int, bytes]] = []
     stamp_ns = 5_000_000_000
