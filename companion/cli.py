@@ -301,6 +301,45 @@ def edit(
     out.print(f"{path}  replay it with: companion replay {path}", highlight=False, soft_wrap=True)
 
 
+@app.command()
+def plan(
+    site: Annotated[
+        Path, typer.Argument(metavar="SITE", help="Site file with walls, or the name of one in params/sites.")
+    ],
+    scenario: Annotated[
+        str | None,
+        typer.Option("--scenario", metavar="NAME", help="Take furniture from the boxes of this scenario."),
+    ] = None,
+    limit: Annotated[
+        float, typer.Option("--limit", min=0.001, metavar="M", help="Position error that is still good [m].")
+    ] = 0.2,
+    sigma: Annotated[
+        float | None,
+        typer.Option("--sigma", min=0.001, metavar="M", help="Range noise [m]; default: that of ekf."),
+    ] = None,
+    folder: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for plan.png.")] = Path(
+        "out/plan"
+    ),
+    sets: Sets = None,
+) -> None:
+    """Say how accurate ranges can be over the floor, where they are bad, where one more anchor helps most.
+
+    Walls and furniture block ranges, and a blocked range does not count. The error is the least that a single
+    frame of ranges allows (Cramer-Rao): a filter with a LiDAR does better, nothing without memory does.
+    """
+    from companion.plan import plan_layout
+    from companion.plan_plot import plan_figure
+    from companion.sim.scenario import load_scenario
+
+    config = load_config(named_file(site, "sites"), sets or [])
+    world = load_scenario(_scenario_path(scenario), None, []).world if scenario else None
+    layout = plan_layout(config, world, limit, sigma)
+    plan_figure(layout, config, folder / "plan.png")
+    for line in layout.lines():
+        out.print(line, highlight=False, soft_wrap=True)
+    out.print(f"picture  {folder / 'plan.png'}", highlight=False, soft_wrap=True)
+
+
 @app.command("import")
 def import_recording(
     source: Annotated[

@@ -20,6 +20,9 @@ from companion.metrics import Alignment
 if TYPE_CHECKING:
     from companion.evaluation import Evaluation
 
+_TABLE_WIDTH = 100
+"""Of what goes to a file, where there is no terminal to fit into."""
+
 app = typer.Typer(help="Measure how good the algorithms are.", no_args_is_help=True, rich_markup_mode="rich")
 
 
@@ -99,6 +102,8 @@ def scenario(
     from companion.log_trial import LOG_SUFFIX
 
     out, err = Console(), Console(stderr=True, highlight=False, soft_wrap=True)
+    if not out.is_terminal:
+        out.width = max(out.width, _TABLE_WIDTH)
     choices = DEFAULT_CHOICES if estimators is None else estimators.split(",")
     if folder is not None:
         _make_writable(folder / "report.md")

@@ -1,8 +1,9 @@
 """Recordings of others through our own drivers, and measurements as text there and back."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -156,22 +157,22 @@ def test_a_ros_bag_gives_scans_ranges_inertial_samples_and_a_reference(tmp_path:
 def write_bag(folder: Path, version: int) -> Path:
     """Five messages of each kind, 0.1 s apart; the third beam of every scan is out of reach."""
     store = get_typestore(Stores.ROS1_NOETIC if version == 1 else Stores.ROS2_HUMBLE)
-    types = store.types
+    types: Any = store.types
 
-    def stamp(k: int) -> object:
+    def stamp(k: int) -> Any:
         at_ns = STAMP_NS + k * 100_000_000
         time = types["builtin_interfaces/msg/Time"](sec=at_ns // 10**9, nanosec=at_ns % 10**9)
         head = {"seq": k} if version == 1 else {}
         return types["std_msgs/msg/Header"](stamp=time, frame_id="anchor_2", **head)
 
-    def vector(x: float, y: float, z: float) -> object:
+    def vector(x: float, y: float, z: float) -> Any:
         return types["geometry_msgs/msg/Vector3"](x=x, y=y, z=z)
 
     beams = np.full(100, 4.0, np.float32)
     beams[3] = 50.0
     quaternion = types["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=np.sqrt(0.5), w=np.sqrt(0.5))
     nine, many = np.zeros(9), np.zeros(36)
-    messages = [
+    messages: list[tuple[str, Callable[[int], Any]]] = [
         (
             "/scan",
             lambda k: types["sensor_msgs/msg/LaserScan"](
