@@ -20,7 +20,6 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 from typer.core import TyperGroup
 
 from companion import __version__
-from companion.config import default_toml, load_config, named_file
 from companion.doctor import app as doctor
 from companion.errors import UserError
 from companion.evaluate_cli import app as evaluate_app
@@ -146,6 +145,7 @@ def run(
     Missing ports and a missing autopilot are waited for, and taken up again after an unplug. A pose is only
     sent while its health is ok or degraded.
     """
+    from companion.config import load_config, named_file
     from companion.live import LiveRun
 
     assignments = [*(sets or []), *([f"mavlink.url={mavlink}"] if mavlink is not None else [])]
@@ -238,6 +238,7 @@ def replay(
     poses, byte for byte. The settings are those stored in the log; change them with --set, or give a
     corrected site file with --site.
     """
+    from companion.config import load_config, named_file
     from companion.log import Log
     from companion.replay import config_of, write_outputs
     from companion.replay import replay as run_log
@@ -327,6 +328,7 @@ def plan(
     Walls and furniture block ranges, and a blocked range does not count. The error is the least that a single
     frame of ranges allows (Cramer-Rao): a filter with a LiDAR does better, nothing without memory does.
     """
+    from companion.config import load_config, named_file
     from companion.plan import plan_layout
     from companion.plan_plot import plan_figure
     from companion.sim.scenario import load_scenario
@@ -366,6 +368,7 @@ def import_recording(
     Ranges become LinkTrack frames, scans RPLIDAR packets: replay and evaluate take the one path that a
     robot takes.
     """
+    from companion.config import named_file
     from companion.importers.sources import import_log
 
     count = import_log(source, path, site and named_file(site, "sites"), sets, truth)
@@ -395,6 +398,8 @@ def dump_config(
     sets: Sets = None,
 ) -> None:
     """Print every setting with its default, or a site's whole configuration, as TOML."""
+    from companion.config import default_toml, load_config, named_file
+
     if site is None:
         if sets:
             raise UserError("--set: give --site too; the defaults alone are no configuration to change")
@@ -417,6 +422,8 @@ def main() -> NoReturn:
 
 
 def _scenario_path(name: str) -> Path:
+    from companion.config import named_file
+
     return named_file(Path(name), "scenarios")
 
 

@@ -13,9 +13,8 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from companion.config import named_file
+from companion.alignment import Alignment
 from companion.errors import UserError
-from companion.metrics import Alignment
 
 if TYPE_CHECKING:
     from companion.evaluation import Evaluation
@@ -97,6 +96,7 @@ def scenario(
     excepted. Where the scenario holds figures of a paper, they stand below ours. Ctrl-C ends it and keeps
     the trials that are done (exit code 1).
     """
+    from companion.config import named_file
     from companion.evaluation import DEFAULT_CHOICES, evaluate_scenario
     from companion.evaluation_table import evaluation_notes, evaluation_table, trust_table
     from companion.log_trial import LOG_SUFFIX

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from companion.alignment import Alignment
 from companion.config import Config
 from companion.errors import UserError
 from companion.estimator_choice import chosen_settings, split_choice
@@ -20,7 +21,7 @@ from companion.evaluate import Errors
 from companion.fault_trial import run_fault_trial
 from companion.log_edit.faults import parse_fault
 from companion.log_trial import LOG_SUFFIX, log_config, run_log_trial
-from companion.metrics import Alignment, chi2_mean_bounds
+from companion.metrics import chi2_mean_bounds
 from companion.sim.scenario import load_scenario
 from companion.sim.scenario_tables import PaperTable
 from companion.trial import LIDAR_ALONE, UWB_ALONE, TrialFigures, run_trial

@@ -5,13 +5,13 @@ from pathlib import Path
 
 import numpy as np
 
+from companion.alignment import Alignment
 from companion.config import Config
 from companion.errors import UserError
 from companion.log import Log, RawChunk, Truth
 from companion.log_edit.edit import edit_records
 from companion.log_edit.faults import parse_fault
 from companion.log_trial import LOG_SUFFIX, run_records
-from companion.metrics import Alignment
 from companion.replay import config_of
 from companion.sim.scenario import load_scenario
 from companion.sim.simulate import START_NS, records

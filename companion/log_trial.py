@@ -5,11 +5,11 @@ from pathlib import Path
 
 import numpy as np
 
+from companion.alignment import Alignment
 from companion.config import Config
 from companion.errors import UserError
 from companion.evaluate import Reference, compare
 from companion.log import Log, RawChunk, Truth
-from companion.metrics import Alignment
 from companion.pipeline import Chain, Pipeline
 from companion.replay import config_of
 from companion.trial import TrialFigures, make_choice, monitor_of, trial_figures

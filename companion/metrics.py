@@ -1,15 +1,15 @@
-"""Figures of a track against truth: trajectory error after a stated alignment, drift, integrity.
+"""Figures of a track against truth: trajectory error, drift, integrity.
 
 Source: Zhang and Scaramuzza, "A Tutorial on Quantitative Trajectory Evaluation for Visual(-Inertial)
 Odometry", IROS 2018, for the errors and alignments.
 """
 
 from collections.abc import Sequence
-from enum import StrEnum
 
 import numpy as np
 from scipy.stats import chi2
 
+from companion.alignment import Alignment
 from companion.evaluate import Errors
 from estimators.geometry import compose, inverse, wrap_angle
 from estimators.messages import FloatArray, IntArray
@@ -19,17 +19,6 @@ RPE_DISTANCE = 1.0
 THREE_SIGMA = 0.9973
 """Share of a normal law within three standard deviations."""
 NEES_CONFIDENCE = 0.95
-
-
-class Alignment(StrEnum):
-    """How a track is moved onto the truth before its trajectory error is taken."""
-
-    NONE = "none"
-    """Not at all: the track claims to be in the map's frame."""
-    FIRST_POSE = "yaw+translation"
-    """Yaw and translation of the first pose: what odometry without a known start deserves."""
-    SE2 = "se2"
-    """Yaw and translation that fit all positions best (on a floor also the 4-DOF alignment of VIO)."""
 
 
 def alignment_of(poses: FloatArray, truth: FloatArray, alignment: Alignment) -> FloatArray:

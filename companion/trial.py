@@ -6,12 +6,13 @@ from pathlib import Path
 
 import numpy as np
 
+from companion.alignment import Alignment
 from companion.config import Config
 from companion.estimator_choice import chosen_settings, split_choice
 from companion.evaluate import Errors, Reference, compare
 from companion.health import HealthMonitor
 from companion.log import Truth
-from companion.metrics import Alignment, integrity_violations, relative_errors, trajectory_error
+from companion.metrics import integrity_violations, relative_errors, trajectory_error
 from companion.pipeline import Chain, Pipeline, make_sensors
 from companion.sim.measurements import MeasuredWalk, measure, setup_of
 from companion.sim.scenario import Scenario, load_scenario

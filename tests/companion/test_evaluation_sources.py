@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
+from companion.alignment import Alignment
 from companion.errors import UserError
 from companion.evaluation import Evaluation, evaluate_scenario
 from companion.evaluation_plots import evaluation_figure
 from companion.evaluation_table import markdown
 from companion.log import Log, LogWriter, RawChunk
-from companion.metrics import Alignment
 from companion.replay import config_of, replay
 from companion.trial_runner import run_trials
 from companion.worst_trial import write_worst_trial

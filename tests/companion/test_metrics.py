@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import chi2
 
+from companion.alignment import Alignment
 from companion.evaluate import Errors
 from companion.metrics import (
-    Alignment,
     alignment_of,
     chi2_mean_bounds,
     integrity_violations,
