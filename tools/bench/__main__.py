@@ -17,7 +17,7 @@ import typer
 from rich.console import Console
 from rich.progress import Progress
 
-from tools.bench import chain, decoders, processes
+from tools.bench import chain, decoders, growth, processes
 from tools.bench.decoders import DisagreementError
 from tools.bench.rows import ROUNDS, TOLERANCE, Row, measure, shortfalls, table
 
@@ -30,11 +30,16 @@ def main(
     json_file: Annotated[
         Path | None, typer.Option("--json", metavar="FILE", help="Write the rows here too.")
     ] = None,
+    curves: Annotated[bool, typer.Option("--growth", help="Instead of rows, how costs grow.")] = False,
     check: Annotated[
         bool, typer.Option("--check", help="Exit with 1 if a ratio falls short of the baseline.")
     ] = False,
 ) -> None:
     """Measure the hot paths beside what others make of the same bytes."""
+    if curves:
+        title = f"Python {platform.python_version()}, {datetime.date.today()}; CPU time"
+        Console().print(growth.curves_table([curve() for curve in growth.CURVES], title))
+        return
     known = [*BENCHMARKS, *processes.ROWS]
     names = only.split(",") if only else known
     for name in names:
