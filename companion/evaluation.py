@@ -72,6 +72,7 @@ class MeanFigures:
     availability: float
     first_fix_s: float | None
     integrity: float | None
+    epoch_bound_ratio: float | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -258,6 +259,7 @@ def _mean(results: list[TrialFigures | None]) -> MeanFigures | None:
         nis_bounds=chi2_mean_bounds([1] * nis_count) if nis_count else None,
         first_fix_s=mean_if_known("first_fix_s"),
         integrity=float(np.mean(integrities)) if integrities else None,
+        epoch_bound_ratio=mean_if_known("epoch_bound_ratio"),
     )
 
 

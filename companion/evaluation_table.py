@@ -12,6 +12,7 @@ _PAPER = "  paper"
 _ERRORS = ("RMSE\nm", "\nx", "\ny", "max\nm", "\nx", "\ny", "yaw\ndeg")
 _CONSISTENCY = ("NEES\n(95 %)", "update us\n50/99 %", "RMSE/\nbound")
 _TRUST = (
+    "RMSE/\nepoch",
     "ATE\nm",
     "RPE\nm/m",
     "RPE\ndeg/m",
@@ -58,6 +59,7 @@ def evaluation_notes(result: Evaluation) -> list[str]:
     notes = [
         "NEES bounds: chi-square, one independent sample a trial (instants of a trial are correlated)",
         f"ATE: alignment {result.alignment}; RPE: over 1 m of the way; healthy: a live run would send it",
+        "RMSE/bound: posterior Cramer-Rao; RMSE/epoch: of one frame of unblocked ranges, without memory",
     ]
     if result.paper:
         notes.append(f"paper: {result.paper.source}")
@@ -124,6 +126,7 @@ def _trust_cells(figures: MeanFigures) -> list[str]:
     if figures.nis is not None and bounds is not None:
         nis = f"{figures.nis:.2f} ({bounds[0]:.2f}-{bounds[1]:.2f})"
     return [
+        _known(figures.epoch_bound_ratio, 2),
         _short(figures.ate_m, 3),
         _known(figures.rpe_m, 3),
         _known(figures.rpe_deg, 2),

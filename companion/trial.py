@@ -20,11 +20,21 @@ from companion.sim.simulate import START_NS, converse
 from companion.watched import WatchedEstimator
 from estimators import make_estimator
 from estimators.base import Estimator, Setup
-from estimators.bounds import landmark_information, posterior_bound, range_information
+from estimators.bounds import (
+    landmark_information,
+    position_information,
+    posterior_bound,
+    range_information,
+)
+from estimators.geometry import transform_each
 from estimators.lidar.dead_reckoning import DeadReckoning
 from estimators.lidar.scan_matching import ScanMatcher
 from estimators.messages import FloatArray, PoseEstimate, RangeFrame, Scan
 
+_BOUND_POSES = 300
+"""The bound of single frames is taken at about so many poses of the walk."""
+_WORST_CONDITION = 1e4
+"""Of information that still tells a position."""
 UWB_ALONE, LIDAR_ALONE = "uwb_ls", "lidar"
 """The single sensors: `least_squares` on ranges alone; increments added up from the true start."""
 
@@ -51,6 +61,8 @@ class TrialFigures:
         nis_count: how many they are.
         first_fix_s: time from the first instant to the first pose that a live run would send; None without.
         integrity: share of the poses that would be sent whose error is beyond 3 sigma; None without any.
+        epoch_bound_ratio: `rmse_m` over what a single frame of unblocked ranges allows; below 1 for what has
+            a memory or a LiDAR; None when not known.
         errors: at every instant.
     """
 
@@ -74,6 +86,7 @@ class TrialFigures:
     nis_count: int
     first_fix_s: float | None
     integrity: float | None
+    epoch_bound_ratio: float | None
     errors: Errors
 
 
@@ -114,9 +127,15 @@ def run_trial(
         truths, instants = _run_chain(scenario, watched, poses)
     reference = Reference(truths)
     covered = sum(reference.covers(stamp_ns) for stamp_ns in instants)
+    epoch_bound = _epoch_bound(scenario, setup, np.array([truth.pose for truth in truths]))
     return {
         choice: trial_figures(
-            compare(poses[choice], reference, covered), watched[choice], instants[0], bound, alignment
+            compare(poses[choice], reference, covered),
+            watched[choice],
+            instants[0],
+            bound,
+            alignment,
+            epoch_bound,
         )
         for choice in choices
     }
@@ -215,8 +234,34 @@ def _bound(scenario: Scenario, setup: Setup, walk: MeasuredWalk) -> float | None
     return float(np.sqrt((bounds[:, 0, 0] + bounds[:, 1, 1]).mean()))
 
 
+def _epoch_bound(scenario: Scenario, setup: Setup, poses: FloatArray) -> float | None:
+    """Root mean square over the walk of the least error of one frame of ranges [m].
+
+    Blocked ranges do not count. Poses from which ranges give no position are left out; None when there is
+    no other, or without noise.
+    """
+    sigma = scenario.file.uwb.sigma
+    if sigma == 0.0:
+        return None
+    some = poses[:: max(1, len(poses) // _BOUND_POSES)]
+    horizontal = transform_each(some, setup.tag_in_body[None, :2])
+    tags = np.column_stack([horizontal, np.full(len(some), setup.height + setup.tag_in_body[2])])
+    anchors = np.array(list(setup.anchors.values()))
+    clear = np.array([scenario.world.line_of_sight(tag, anchors) for tag in tags])
+    information = position_information(tags, anchors, clear, sigma)
+    told = np.linalg.cond(information) < _WORST_CONDITION
+    if not told.any():
+        return None
+    return float(np.sqrt(np.linalg.inv(information[told]).trace(axis1=1, axis2=2).mean()))
+
+
 def trial_figures(
-    errors: Errors, watched: WatchedEstimator, begin_ns: int, bound: float | None, alignment: Alignment
+    errors: Errors,
+    watched: WatchedEstimator,
+    begin_ns: int,
+    bound: float | None,
+    alignment: Alignment,
+    epoch_bound: float | None = None,
 ) -> TrialFigures | None:
     """Figures of one estimator in one trial; None when it gave no pose where truth is known.
 
@@ -226,6 +271,7 @@ def trial_figures(
         begin_ns: first instant at which a pose was asked for.
         bound: least position error that any estimator can have, root mean square [m]; None when not known.
         alignment: of the track, for `TrialFigures.ate_m`.
+        epoch_bound: as `bound`, for estimators of a single frame of ranges [m].
     """
     accuracy = errors.accuracy()
     if accuracy is None:
@@ -258,5 +304,6 @@ def trial_figures(
         nis_count=len(watched.nis),
         first_fix_s=(healthy_ns[0] - begin_ns) * 1e-9 if healthy_ns else None,
         integrity=integrity_violations(errors, healthy_ns),
+        epoch_bound_ratio=accuracy.rmse / epoch_bound if epoch_bound else None,
         errors=errors,
     )

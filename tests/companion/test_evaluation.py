@@ -48,6 +48,7 @@ FIGURES = [
     "availability",
     "first_fix_s",
     "integrity",
+    "epoch_bound_ratio",
 ]
 ALL = ["uwb_ls", "lidar", "ekf"]
 
@@ -156,6 +157,24 @@ def test_the_bound_leaves_blocked_ranges_out_and_counts_landmarks(tmp_path: Path
     assert bound(poor + landmarks) < 0.5 * bound(poor)
 
 
+def test_without_blocked_ranges_least_squares_reaches_the_bound_of_its_frames(tmp_path: Path) -> None:
+    free = "[increments]\nrate = 10\n[uwb]\nrate = 10\nsigma = 0.05\ndropout = 0\n"
+    # Here no anchor hides behind the column.
+    sets = ["anchors.2=[7.85, 4.0, 2.3]"]
+    result = evaluate_scenario(
+        write_scenario(tmp_path, STRAIGHT_ON, free), 6, choices=["uwb_ls", "ekf"], sets=sets
+    )
+    alone, fused = result.estimators["uwb_ls"], result.estimators["ekf"]
+    assert alone is not None
+    assert fused is not None
+    assert alone.epoch_bound_ratio is not None
+    assert fused.epoch_bound_ratio is not None
+    # The antenna is 0.1 m off the body's origin, which least squares takes for it.
+    tag_error = np.sqrt(alone.rmse_m**2 - 0.1**2)
+    assert tag_error / (alone.rmse_m / alone.epoch_bound_ratio) == pytest.approx(1.0, abs=0.1)
+    assert fused.epoch_bound_ratio < 1.0
+
+
 @pytest.mark.parametrize(
     "more",
     [
@@ -248,7 +267,8 @@ def test_the_command_prints_our_figures_and_the_papers(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     figures = json.loads((tmp_path / "out.json").read_text())["estimators"]
     assert list(figures) == ["ekf", "lidar"]
-    rows = {line.split()[0]: line.split()[1:] for line in done.stdout.splitlines() if line.strip()}
+    errors, _ = done.stdout.split("RPE", 1)
+    rows = {line.split()[0]: line.split()[1:] for line in errors.splitlines() if line.strip()}
     for i, name in enumerate(["rmse_m", "rmse_x_m", "rmse_y_m", "max_m", "max_x_m", "max_y_m"]):
         assert rows["ekf"][i] == f"{figures['ekf'][name]:.3f}"
     assert rows["paper"] == ["0.987"]

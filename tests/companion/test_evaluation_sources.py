@@ -186,7 +186,7 @@ def test_markdown_has_a_cell_for_every_heading(result: Evaluation) -> None:
     text = markdown(result, ["a.png"])
     tables = [line for line in text.splitlines() if line.startswith("|")]
     widths = [line.count("|") for line in tables]
-    assert sorted(set(widths)) == [9, 12]
+    assert sorted(set(widths)) == [10, 12]
     ekf = result.estimators["ekf"]
     assert ekf is not None
     assert f"| ekf | {ekf.rmse_m:.3f} |" in text
