@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from companion.config import Config
@@ -112,6 +112,7 @@ def test_scans_written_again_are_the_scans_that_were_there(log: Log, records: li
     st.sampled_from([1, 3, 200]),
     st.integers(0, 2**32),
 )
+@example([288, 96], 20_000, 200, 0)  # whole packets: nothing waits when the stream ends
 @settings(max_examples=25)
 def test_any_scans_are_written_so_that_the_driver_reads_them(
     counts: list[int], sample_ns: int, pause: int, seed: int
