@@ -112,15 +112,7 @@ class Chain:
         self.sequencer = Sequencer(round(config.pipeline.hold_ms * 1e6))
         self._pipeline = pipeline
         self._primary = primary
-        measured = {kind for sensor in self.sensors.values() for kind in sensor.MEASURES}
-        inputs = config.mavlink.inputs
-        self._monitor = HealthMonitor(
-            config.health,
-            RangeFrame in measured,
-            Scan in measured or bool(inputs.odometry or inputs.wheels),
-            config.anchors,
-            config.mavlink.heading,
-        )
+        self._monitor = make_monitor(config, self.sensors)
         self._start_ns = start_ns
         self._period_ns = 1e9 / config.pipeline.rate
         self._ticks = 0
@@ -173,6 +165,19 @@ def make_autopilot_input(config: Config) -> dict[str, Decoder]:
     if not any((inputs.attitude, inputs.imu, inputs.height, inputs.odometry, inputs.wheels)):
         return {}
     return {MAVLINK: Autopilot(inputs, config.mavlink.autopilot_id, read_key(Path(key)) if key else None)}
+
+
+def make_monitor(config: Config, sensors: Mapping[str, Sensor]) -> HealthMonitor:
+    """What judges the poses of a run with the site's sensors."""
+    measured = {kind for sensor in sensors.values() for kind in sensor.MEASURES}
+    inputs = config.mavlink.inputs
+    return HealthMonitor(
+        config.health,
+        RangeFrame in measured,
+        Scan in measured or bool(inputs.odometry or inputs.wheels),
+        config.anchors,
+        config.mavlink.heading,
+    )
 
 
 def make_parts(config: Config, names: list[str]) -> tuple[FrontEnd, dict[str, Estimator]]:
