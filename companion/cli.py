@@ -303,7 +303,7 @@ def evaluate(
     excepted. Where the scenario holds figures of a paper, they stand below ours.
     """
     from companion.evaluation import DEFAULT_CHOICES, evaluate_scenario
-    from companion.evaluation_table import evaluation_notes, evaluation_table
+    from companion.evaluation_table import evaluation_notes, evaluation_table, leg_table
 
     choices = DEFAULT_CHOICES if estimators is None else estimators.split(",")
     if json_file is not None and not json_file.parent.is_dir():
@@ -320,6 +320,8 @@ def evaluate(
             lambda: progress.advance(bar),
         )
     out.print(evaluation_table(result))
+    if (legs := leg_table(result)) is not None:
+        out.print(legs)
     for line in evaluation_notes(result):
         out.print(f"  {line}", highlight=False, soft_wrap=True)
     if json_file is not None:

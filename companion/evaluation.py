@@ -18,6 +18,7 @@ from scipy.stats import chi2
 from companion.config import Config
 from companion.errors import UserError
 from companion.estimator_choice import chosen_settings, split_choice
+from companion.legs import LegFigures
 from companion.sim.scenario import load_scenario
 from companion.sim.scenario_tables import PaperTable
 from companion.trial import LIDAR_ALONE, UWB_ALONE, TrialFigures, run_trial
@@ -57,6 +58,8 @@ class MeanFigures:
     nees_bounds: tuple[float, float]
     update_us: UpdateTime
     bound_ratio: float | None
+    iterations: float | None
+    legs: dict[str, LegFigures]
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,7 +183,21 @@ def _mean(results: list[TrialFigures | None]) -> MeanFigures | None:
         nees_bounds=nees_bounds([each.nees_dof for each in figures]),
         update_us=UpdateTime(median, p99),
         bound_ratio=mean_if_known("bound_ratio"),
+        iterations=mean_if_known("iterations"),
+        legs=_mean_legs([each.legs for each in figures]),
     )
+
+
+def _mean_legs(trials: list[dict[str, LegFigures]]) -> dict[str, LegFigures]:
+    """Means over trials on the legs that every trial has figures for."""
+    names = [name for name in trials[0] if all(name in legs for legs in trials)]
+    return {
+        name: LegFigures(
+            rmse_m=float(np.mean([legs[name].rmse_m for legs in trials])),
+            max_m=float(np.mean([legs[name].max_m for legs in trials])),
+        )
+        for name in names
+    }
 
 
 _ALWAYS_KNOWN = ("rmse_m", "rmse_x_m", "rmse_y_m", "max_m", "max_x_m", "max_y_m", "p95_m", "nees")

@@ -4,7 +4,8 @@ from rich import box
 from rich.table import Table
 
 from companion.evaluation import Evaluation, MeanFigures
-from companion.sim.scenario_tables import PaperFigures
+from companion.legs import LegFigures
+from companion.sim.scenario_tables import PaperFigures, PaperLeg
 
 
 def evaluation_table(result: Evaluation) -> Table:
@@ -24,6 +25,25 @@ def evaluation_table(result: Evaluation) -> Table:
     return table
 
 
+def leg_table(result: Evaluation) -> Table | None:
+    """RMSE and largest error on every named leg, published figures below ours; None without such legs."""
+    names = list(dict.fromkeys(leg for mean in result.estimators.values() if mean for leg in mean.legs))
+    if not names:
+        return None
+    table = Table(title="legs: RMSE / max [m]", title_justify="left", box=box.SIMPLE_HEAD, padding=0)
+    table.add_column("estimator", no_wrap=True)
+    for name in names:
+        table.add_column(name, justify="right", no_wrap=True)
+    published = result.paper.estimators if result.paper else {}
+    for choice, mean in result.estimators.items():
+        ours = mean.legs if mean else {}
+        table.add_row(choice, *(_leg_cell(ours.get(name)) for name in names))
+        if choice in published and published[choice].legs:
+            stated = published[choice].legs
+            table.add_row("  paper", *(_leg_cell(stated.get(name)) for name in names), style="dim")
+    return table
+
+
 def evaluation_notes(result: Evaluation) -> list[str]:
     """What the table leaves open, a line each."""
     notes = ["NEES bounds: chi-square, one independent sample a trial (instants of a trial are correlated)"]
@@ -33,6 +53,11 @@ def evaluation_notes(result: Evaluation) -> list[str]:
         f"{name}: a pose at {share:.1%} of the instants only"
         for name, share in result.availability.items()
         if share < 0.99
+    ]
+    notes += [
+        f"{name}: {mean.iterations:.1f} iterations of its solver for a frame"
+        for name, mean in result.estimators.items()
+        if mean is not None and mean.iterations is not None
     ]
     return notes
 
@@ -52,6 +77,12 @@ def _cells(figures: MeanFigures) -> list[str]:
 def _paper_cells(figures: PaperFigures) -> list[str]:
     stated = [getattr(figures, key, None) for key in _POSITION]
     return ["" if value is None else _short(value, 3) for value in stated]
+
+
+def _leg_cell(figures: LegFigures | PaperLeg | None) -> str:
+    if figures is None or figures.rmse_m is None and figures.max_m is None:
+        return ""
+    return " / ".join("-" if v is None else _short(v, 3) for v in (figures.rmse_m, figures.max_m))
 
 
 _POSITION = ("rmse_m", "rmse_x_m", "rmse_y_m", "max_m", "max_x_m", "max_y_m")

@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from statistics import fmean
 
 from scipy.spatial.transform import Rotation
 
@@ -84,6 +85,7 @@ class Replay:
         errors: estimator -> errors against the log's truth; empty without truth.
         update_times: estimator (and `scan_matcher`) -> time of its updates.
         verdicts: estimator -> how often each verdict was given to a range or increment.
+        iterations: estimator -> steps of its solver for each frame; empty without such a solver.
         health: state -> number of ticks.
         sensors: sensor -> what its decoder counted.
         late: measurements that came too late to be used.
@@ -97,6 +99,7 @@ class Replay:
     errors: dict[str, Errors] = field(default_factory=dict)
     update_times: dict[str, Stopwatch] = field(default_factory=dict)
     verdicts: dict[str, Counter[str]] = field(default_factory=dict)
+    iterations: dict[str, list[int]] = field(default_factory=dict)
     health: Counter[str] = field(default_factory=Counter)
     sensors: dict[str, DecodeStats] = field(default_factory=dict)
     late: int = 0
@@ -141,6 +144,7 @@ def replay(
     result = Replay(config, names, {name: [] for name in names})
     result.update_times = {name: Stopwatch() for name in ["scan_matcher", *names]}
     result.verdicts = {name: Counter() for name in names}
+    result.iterations = {name: [] for name in names}
     chain = Chain(config, begin_ns, _timed_pipeline(config, names, result.update_times), names[0])
     truths: list[Truth] = []
     ticks_ns: list[int] = []
@@ -152,6 +156,8 @@ def replay(
             if isinstance(outcome.measurement, RangeFrame | PoseIncrement):
                 for name, report in outcome.reports.items():
                     result.verdicts[name].update(report.verdicts)
+                    if report.iterations is not None:
+                        result.iterations[name].append(report.iterations)
         for name, pose in tick.poses.items():
             if pose is not None:
                 result.poses[name].append(pose)
@@ -216,6 +222,7 @@ def summary(result: Replay) -> dict[str, object]:
             "accuracy": asdict(accuracy) if (accuracy := result.accuracy(name)) else None,
             "update_ms": result.update_times[name].mean_ms,
             "verdicts": dict(result.verdicts[name]),
+            "solver_iterations": fmean(taken) if (taken := result.iterations[name]) else None,
         }
         for name in result.names
     }

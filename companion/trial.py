@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +11,7 @@ from companion.estimator_choice import chosen_settings, split_choice
 from companion.evaluate import Errors, Reference, compare
 from companion.log import Truth
 from companion.pipeline import Chain, Pipeline
+from companion.legs import LegFigures, leg_figures
 from companion.sim.measurements import MeasuredWalk, measure, setup_of
 from companion.sim.scenario import Scenario, load_scenario
 from companion.sim.simulate import START_NS, converse
@@ -39,6 +40,8 @@ class TrialFigures:
         availability: share of the instants at which there was a pose.
         update_us: median and 99th percentile of the time of an update that was used [us].
         bound_ratio: `rmse_m` over the posterior Cramer-Rao bound; None when that is not known.
+        iterations: mean steps of its solver for a frame; None without such a solver.
+        legs: the same errors on the legs that the scenario names.
     """
 
     rmse_m: float
@@ -54,6 +57,8 @@ class TrialFigures:
     availability: float
     update_us: tuple[float, float]
     bound_ratio: float | None
+    iterations: float | None = None
+    legs: dict[str, LegFigures] = field(default_factory=dict)
 
 
 def run_trial(
@@ -86,10 +91,14 @@ def run_trial(
         truths, instants = _run_chain(scenario, timed, poses)
     reference = Reference(truths)
     covered = sum(reference.covers(stamp_ns) for stamp_ns in instants)
-    return {
-        choice: _figures(compare(poses[choice], reference, covered), timed[choice].seconds, bound)
-        for choice in choices
-    }
+    found: dict[str, TrialFigures | None] = {}
+    for choice in choices:
+        errors = compare(poses[choice], reference, covered)
+        figures = _figures(errors, timed[choice].seconds, bound)
+        iterations = float(np.mean(taken)) if (taken := timed[choice].iterations) else None
+        legs = leg_figures(scenario, errors) if scenario.file.trajectory.leg_names else {}
+        found[choice] = replace(figures, iterations=iterations, legs=legs) if figures else None
+    return found
 
 
 class _TimedEstimator:
@@ -98,6 +107,7 @@ class _TimedEstimator:
     def __init__(self, estimator: Estimator) -> None:
         self._estimator = estimator
         self.seconds: list[float] = []
+        self.iterations: list[int] = []
 
     def reset(self) -> None:
         self._estimator.reset()
@@ -108,6 +118,8 @@ class _TimedEstimator:
         took = time.perf_counter() - begin
         if Verdict.NOT_USED not in report.verdicts:
             self.seconds.append(took)
+        if report.iterations is not None:
+            self.iterations.append(report.iterations)
         return report
 
     def pose_at(self, stamp_ns: int) -> PoseEstimate | None:

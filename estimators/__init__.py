@@ -9,8 +9,12 @@ from estimators.base import Estimator, Setup
 
 ESTIMATORS: dict[str, tuple[str, str]] = {
     "ekf": ("estimators.ekf", "Ekf"),
+    "gd": ("estimators.uwb.gradient_descent", "GradientDescent"),
+    "gd_pf": ("estimators.uwb.gd_pf", "GdPf"),
     "least_squares": ("estimators.least_squares", "LeastSquares"),
     "lidar_odometry": ("estimators.lidar.odometry", "LidarOdometry"),
+    "linear_ls": ("estimators.uwb.gradient_descent", "LinearLeastSquares"),
+    "momentum_gd": ("estimators.uwb.gradient_descent", "MomentumGradientDescent"),
     "pf": ("estimators.particle_filter", "ParticleFilter"),
     "pf_ibas": ("estimators.pf_ibas", "PfIbas"),
     "pf_ibas_printed": ("estimators.pf_ibas", "PrintedPfIbas"),

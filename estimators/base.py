@@ -42,11 +42,13 @@ class Report:
         verdicts: one per range of a RangeFrame, else one.
         residuals: like `verdicts`; measured minus predicted [m] for ranges, NaN where there is none.
         nis: like `verdicts`; normalised innovation squared, NaN where there is none.
+        iterations: steps of an iterative solver; None where none was at work.
     """
 
     verdicts: tuple[Verdict, ...]
     residuals: FloatArray = field(default_factory=lambda: _EMPTY)
     nis: FloatArray = field(default_factory=lambda: _EMPTY)
+    iterations: int | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

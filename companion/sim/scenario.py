@@ -2,10 +2,10 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Self
 
 import numpy as np
-from pydantic import Field, ValidationInfo, field_validator
+from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from companion.config import Config, Coordinate, Table, known, load_config, parse_toml, read_text, validated
 from companion.errors import UserError
@@ -47,6 +47,18 @@ class TrajectoryTable(Table):
     accel: float = Field(0.5, gt=0, le=20, description="[m/s^2]")
     turn_rate_deg: float = Field(60.0, gt=0, le=360, description="[deg/s]")
     rest: float = Field(2.0, ge=0, le=600, description="standing still before and after [s]")
+    leg_names: list[str] = Field(
+        [], description="names of the legs, in order, to have figures for each; none: for the whole alone"
+    )
+
+    @field_validator("leg_names")
+    @classmethod
+    def _one_name_a_leg(cls, names: list[str], info: ValidationInfo) -> list[str]:
+        corners, laps = len(info.data.get("waypoints", [])), info.data.get("laps", 0)
+        legs = corners * laps if laps else corners - 1
+        if names and (len(names) != legs or len(set(names)) < legs):
+            raise ValueError(f"{legs} different names are needed, one for each leg")
+        return names
 
 
 class UwbTable(Table):
@@ -129,6 +141,12 @@ class ScenarioFile(Table):
     increments: IncrementsTable | None = None
     landmarks: LandmarksTable | None = None
     paper: PaperTable | None = None
+
+    @model_validator(mode="after")
+    def _legs_without_bytes(self) -> Self:
+        if self.trajectory.leg_names and self.increments is None:
+            raise ValueError("trajectory.leg_names: figures for legs need a table [increments]")
+        return self
 
     @field_validator("landmarks")
     @classmethod

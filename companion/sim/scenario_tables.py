@@ -81,18 +81,27 @@ class LandmarksTable(Table):
     max_range: float = Field(8.0, gt=0, le=1000, description="[m]")
 
 
+class PaperLeg(Table):
+    """What a publication states of one estimator on one leg."""
+
+    rmse_m: Figure | None = None
+    max_m: Figure | None = None
+
+
 class PaperFigures(Table):
     """What a publication states of one estimator, under the names of our own figures."""
 
     rmse_m: Figure | None = None
+    max_m: Figure | None = None
     rmse_x_m: Figure | None = None
     rmse_y_m: Figure | None = None
     max_x_m: Figure | None = None
     max_y_m: Figure | None = None
+    legs: dict[str, PaperLeg] = Field({}, description="by the name of the leg")
 
 
 class PaperTable(Table):
     """Published figures, shown beside ours."""
 
     source: str
-    estimators: dict[str, PaperFigures] = Field(description="by the name of our estimator that is meant")
+    estimators: dict[str, PaperFigures] = Field({}, description="by the name of our estimator that is meant")
