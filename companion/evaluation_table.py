@@ -80,7 +80,7 @@ def _paper_cells(figures: PaperFigures) -> list[str]:
 
 
 def _leg_cell(figures: LegFigures | PaperLeg | None) -> str:
-    if figures is None or figures.rmse_m is None and figures.max_m is None:
+    if figures is None or (figures.rmse_m is None and figures.max_m is None):
         return ""
     return " / ".join("-" if v is None else _short(v, 3) for v in (figures.rmse_m, figures.max_m))
 

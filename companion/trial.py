@@ -9,9 +9,9 @@ import numpy as np
 
 from companion.estimator_choice import chosen_settings, split_choice
 from companion.evaluate import Errors, Reference, compare
+from companion.legs import LegFigures, leg_figures
 from companion.log import Truth
 from companion.pipeline import Chain, Pipeline
-from companion.legs import LegFigures, leg_figures
 from companion.sim.measurements import MeasuredWalk, measure, setup_of
 from companion.sim.scenario import Scenario, load_scenario
 from companion.sim.simulate import START_NS, converse

@@ -18,6 +18,8 @@ ESTIMATORS: dict[str, tuple[str, str]] = {
     "pf": ("estimators.particle_filter", "ParticleFilter"),
     "pf_ibas": ("estimators.pf_ibas", "PfIbas"),
     "pf_ibas_printed": ("estimators.pf_ibas", "PrintedPfIbas"),
+    "uwb_imu_adaptive_ekf": ("estimators.uwb.uwb_imu_ekf", "UwbImuAdaptiveEkf"),
+    "uwb_imu_ekf": ("estimators.uwb.uwb_imu_ekf", "UwbImuEkf"),
 }
 """Name on the command line -> module and class. The class has a nested pydantic `Config`."""
 

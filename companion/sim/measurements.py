@@ -8,13 +8,23 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from companion.sim.inertial import draw_inertial
 from companion.sim.ranging import draw_ranging
 from companion.sim.scenario import Scenario
 from companion.sim.scenario_tables import IncrementsTable, LandmarksTable
 from companion.sim.simulate import START_NS
 from estimators.base import Setup
 from estimators.geometry import between, rotation, transform_each, wrap_angle, wrap_angles
-from estimators.messages import FloatArray, IntArray, LandmarkFrame, PoseIncrement, RangeFrame
+from estimators.messages import (
+    Attitude,
+    FloatArray,
+    ImuSample,
+    IntArray,
+    LandmarkFrame,
+    Measurement,
+    PoseIncrement,
+    RangeFrame,
+)
 
 TAG_ID = 1
 
@@ -30,6 +40,7 @@ class MeasuredWalk:
         range_frames: in stamp order.
         unblocked: for every range frame the anchors whose range came straight.
         landmark_frames: in stamp order.
+        inertial: attitudes, each before the sample of its instant.
     """
 
     stamps_ns: IntArray
@@ -38,10 +49,11 @@ class MeasuredWalk:
     range_frames: list[RangeFrame]
     unblocked: list[list[int]]
     landmark_frames: list[LandmarkFrame]
+    inertial: list[ImuSample | Attitude]
 
-    def in_order(self) -> list[PoseIncrement | RangeFrame | LandmarkFrame]:
-        """All measurements in stamp order; of one instant the increment first, the landmarks last."""
-        every: list[PoseIncrement | RangeFrame | LandmarkFrame] = [*self.increments]
+    def in_order(self) -> list[Measurement]:
+        """All measurements in stamp order; of one instant the inertial and increment first, landmarks last."""
+        every: list[Measurement] = [*self.inertial, *self.increments]
         every += [*self.range_frames, *self.landmark_frames]
         return sorted(every, key=lambda measurement: measurement.stamp_ns)
 
@@ -62,7 +74,8 @@ def measure(scenario: Scenario) -> MeasuredWalk:
     """
     odometry, landmarks = scenario.file.increments, scenario.file.landmarks
     assert odometry is not None
-    odometry_rng, uwb_rng, landmark_rng = scenario.rng.spawn(3)
+    inertial = scenario.file.inertial
+    odometry_rng, uwb_rng, landmark_rng, inertial_rng = scenario.rng.spawn(4)
     stamps_ns, poses = _instants(scenario, odometry.rate)
     range_frames, unblocked = _range_frames(scenario, uwb_rng)
     return MeasuredWalk(
@@ -72,6 +85,7 @@ def measure(scenario: Scenario) -> MeasuredWalk:
         range_frames=range_frames,
         unblocked=unblocked,
         landmark_frames=_landmark_frames(scenario, landmarks, landmark_rng) if landmarks else [],
+        inertial=draw_inertial(scenario, inertial, inertial_rng) if inertial else [],
     )
 
 

@@ -14,6 +14,7 @@ from companion.sim.lidar_models import LIDAR_MODELS
 from companion.sim.scenario_tables import (
     GaitTable,
     IncrementsTable,
+    InertialTable,
     LandmarksTable,
     PaperTable,
     RandomBoxesTable,
@@ -140,6 +141,7 @@ class ScenarioFile(Table):
     gait: GaitTable | None = None
     increments: IncrementsTable | None = None
     landmarks: LandmarksTable | None = None
+    inertial: InertialTable | None = None
     paper: PaperTable | None = None
 
     @model_validator(mode="after")
@@ -154,6 +156,13 @@ class ScenarioFile(Table):
         if info.data.get("increments") is None:
             raise ValueError("no emulated device sends landmarks, they need a table [increments]")
         return landmarks
+
+    @field_validator("inertial")
+    @classmethod
+    def _at_a_tag_without_bytes(cls, inertial: InertialTable, info: ValidationInfo) -> InertialTable:
+        if info.data.get("increments") is None:
+            raise ValueError("the emulated tag has its own sensor [imu], this one needs a table [increments]")
+        return inertial
 
 
 @dataclass(frozen=True, slots=True, eq=False)

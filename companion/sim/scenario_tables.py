@@ -71,6 +71,20 @@ class IncrementsTable(Table):
     )
 
 
+class InertialTable(Table):
+    """Inertial sensor at the tag, with an attitude filter of its own, in a scenario with `[increments]`.
+
+    Bias and tilt are drawn once a trial. Its heading counts from where it was switched on, and wanders.
+    """
+
+    rate: float = Field(50.0, ge=1, le=1000, description="samples and attitudes a second [Hz]")
+    accel_sigma: float = Field(0.05, ge=0, le=10, description="noise of an acceleration [m/s^2]")
+    accel_bias: float = Field(0.05, ge=0, le=10, description="standard deviation of the bias [m/s^2]")
+    gyro_sigma: float = Field(0.01, ge=0, le=10, description="noise of a turn rate [rad/s]")
+    tilt_sigma_deg: float = Field(0.3, ge=0, le=45, description="error of roll and of pitch [deg]")
+    heading_walk_deg: float = Field(0.1, ge=0, le=45, description="walk of the heading [deg/sqrt(s)]")
+
+
 class LandmarksTable(Table):
     """Known landmarks, seen whole or not at all, in a scenario with `[increments]`."""
 

@@ -39,9 +39,9 @@ class FrameSolver(ABC):
     """Position of every range frame; which solver finds it is the subclass's.
 
     It knows no heading, so the body is taken to be below or above the tag and the lever arm enters the
-    covariance. In space the height is solved for when the anchors do not lie in one plane; when they do, it is
-    unobservable: the position is solved in the plane at the site's height and the variance of the height is
-    infinite.
+    covariance. In space the height is solved for when the anchors do not lie in one plane. When they do, it
+    is unobservable: the position is solved in the plane at the site's height, and the variance of the height
+    is infinite.
 
     Source: li2022 Eq. (1)-(2), positions in the plane from 3 anchors, in space from 4.
     """

@@ -10,6 +10,8 @@ from estimators.resampling import stratified
 from estimators.uwb.frame_solver import TagFix
 from estimators.uwb.gradient_descent import MomentumGradientDescent
 
+TAIL_FREEDOM = 3.0
+"""Degrees of freedom of the Student law of solved positions: a gross error must not decide alone."""
 KEPT_SHARE = 0.1
 """Share of the resampled particles that are drawn whatever their weight."""
 
@@ -30,7 +32,7 @@ class GdPf:
     class Config(MomentumGradientDescent.Config):
         """Settings of `gd_pf`."""
 
-        particles: int = Field(500, ge=10, le=100_000, description="how many")
+        particles: int = Field(2000, ge=10, le=100_000, description="how many")
         accel_noise: float = Field(
             0.5,
             gt=0,
@@ -72,7 +74,7 @@ class GdPf:
         return report
 
     def pose_at(self, stamp_ns: int) -> PoseEstimate | None:
-        """Mean of the particles moved to a time; None without one within `max_age`. Yaw variance is infinite."""
+        """Mean of the particles moved to a time; None after `max_age`. Yaw variance is infinite."""
         fix = self.fix
         if fix is None or abs(dt := (stamp_ns - fix.stamp_ns) * 1e-9) > self._config.max_age:
             return None
@@ -134,7 +136,8 @@ class GdPf:
         known = np.isfinite(np.diag(solved.cov))[: self._config.dimensions].sum()
         off = self._positions[:, :known] - solved.position[:known]
         squares = np.einsum("ni,ij,nj->n", off, np.linalg.inv(solved.cov[:known, :known]), off)
-        log_weights = np.log(self._weights) - 0.5 * squares
+        tails = (TAIL_FREEDOM + known) / 2.0 * np.log1p(squares / TAIL_FREEDOM)
+        log_weights = np.log(self._weights) - tails
         weights = np.exp(log_weights - log_weights.max())
         # What is too light to be a number keeps a weight, so that its logarithm is one.
         self._weights = np.maximum(weights / weights.sum(), 1e-300)

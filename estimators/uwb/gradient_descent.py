@@ -17,7 +17,7 @@ class LinearLeastSquares(FrameSolver):
     class Config(FrameSolver.Config):
         """Settings of `linear_ls`."""
 
-    def _solve(self, anchors: FloatArray, ranges: FloatArray, start: FloatArray) -> Solution:
+    def _solve(self, anchors: FloatArray, ranges: FloatArray, start: FloatArray) -> Solution:  # noqa: ARG002
         return Solution(closed_form(anchors, ranges), 0)
 
 
