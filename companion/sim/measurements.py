@@ -102,14 +102,15 @@ def _increments(
 ) -> list[PoseIncrement]:
     """Increments from each pose to the next.
 
-    Noise of a step is white. A trial's scale error and drift repeat in all of its steps; the covariance of a
-    step has their variance too, but nothing says that they are the same as in the step before.
+    Noise of a step is white. A trial's scale error, drift and slip repeat in all of its steps; the covariance
+    of a step has their variance too, but nothing says that they are the same as in the step before.
     """
     sigma_yaw, drift_sigma = np.deg2rad(table.sigma_yaw_deg), np.deg2rad(table.yaw_drift_deg)
     scale = table.scale_sigma * rng.standard_normal()
     drift = drift_sigma * rng.standard_normal()
     noise = rng.standard_normal((len(poses) - 1, 3)) * [table.sigma_x, table.sigma_y, sigma_yaw]
     map_cov = np.diag([table.sigma_x**2, table.sigma_y**2])
+    slips = [(place, place.slip_sigma * rng.standard_normal(2)) for place in table.diverging]
     increments = [
         PoseIncrement(int(stamps_ns[0]), int(stamps_ns[0]), np.zeros(3), np.zeros((3, 3)), is_keyframe=True)
     ]
@@ -119,11 +120,17 @@ def _increments(
         length = float(np.hypot(step[0], step[1]))
         value = step * [1.0 + scale, 1.0 + scale, 1.0]
         value[:2] += R_body_map @ step_noise[:2]
+        slip_variance = 0.0
+        for place, slip in slips:
+            if place.holds(poses[k]):
+                value[:2] += R_body_map @ slip * length
+                slip_variance += (place.slip_sigma * length) ** 2
         value[2] = wrap_angle(value[2] + drift * length + step_noise[2])
         cov = np.zeros((3, 3))
         cov[:2, :2] = R_body_map @ map_cov @ R_body_map.T + table.scale_sigma**2 * np.outer(
             step[:2], step[:2]
         )
+        cov[:2, :2] += slip_variance * np.eye(2)
         cov[2, 2] = sigma_yaw**2 + (drift_sigma * length) ** 2
         from_ns, to_ns = stamps_ns[k : k + 2].tolist()
         increments.append(PoseIncrement(from_ns, to_ns, value, cov, is_keyframe=True))

@@ -6,6 +6,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from companion.config import Coordinate, Table
+from estimators.messages import FloatArray
 
 Box = tuple[float, float, float, float, float, float]
 Interval = tuple[Coordinate, Coordinate]
@@ -54,6 +55,20 @@ class GaitTable(Table):
     yaw_deg: float = Field(1.0, ge=0, le=45, description="amplitude of the heading [deg]")
 
 
+class DivergenceTable(Table):
+    """A part of the floor where the odometry slips, as a matcher does that finds no structure."""
+
+    x: Interval = Field(description="least and greatest x [m], map frame")
+    y: Interval = Field(description="the same for y [m]")
+    slip_sigma: float = Field(
+        gt=0, le=1, description="false shift along each axis of the map for every metre walked, a trial's"
+    )
+
+    def holds(self, pose: FloatArray) -> bool:
+        """Whether a pose (3,) is in it."""
+        return bool(self.x[0] <= pose[0] <= self.x[1] and self.y[0] <= pose[1] <= self.y[1])
+
+
 class IncrementsTable(Table):
     """Odometry increments in place of a LiDAR. A scenario with this table has no bytes and no scans.
 
@@ -69,6 +84,7 @@ class IncrementsTable(Table):
     yaw_drift_deg: float = Field(
         0.0, ge=0, le=45, description="false turn for every metre walked, a trial's [deg/m]"
     )
+    diverging: list[DivergenceTable] = Field([], description="where it slips")
 
 
 class InertialTable(Table):
