@@ -22,6 +22,7 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 from typer.core import TyperGroup
 
 from companion import __version__
+from companion.calibrate_cli import app as calibrate_app
 from companion.config import default_toml, load_config, params_dir
 from companion.doctor import app as doctor
 from companion.errors import UserError
@@ -54,6 +55,7 @@ app = typer.Typer(
     add_completion=False,
 )
 app.add_typer(doctor, name="doctor")
+app.add_typer(calibrate_app, name="calibrate")
 app.add_typer(evaluate_app, name="evaluate", cls=_ScenarioUnlessNamed)
 out = Console()
 err = Console(stderr=True, highlight=False)

@@ -19,6 +19,7 @@ from estimators import make_estimator
 from estimators.base import Estimator, Report
 from estimators.lidar.scan_matching import ScanMatcher
 from estimators.messages import Measurement, PoseEstimate, PoseIncrement, RangeFrame, Scan
+from estimators.models.range_bias import without_bias
 
 
 class FrontEnd(Protocol):
@@ -102,6 +103,7 @@ class Chain:
         self._primary = primary
         measured = {kind for sensor in self.sensors.values() for kind in sensor.MEASURES}
         self._monitor = HealthMonitor(config.health, RangeFrame in measured, Scan in measured)
+        self._range_biases = config.range_biases()
         self._start_ns = start_ns
         self._period_ns = 1e9 / config.pipeline.rate
         self._ticks = 0
@@ -117,6 +119,9 @@ class Chain:
         sensor = self.sensors.get(chunk.source)
         if sensor is not None and chunk.direction is Direction.IN:
             for measurement in sensor.feed(chunk.data, chunk.stamp_ns):
+                # Here once, so that logs stay as measured and replay takes off what it is told to.
+                if isinstance(measurement, RangeFrame):
+                    measurement = without_bias(measurement, self._range_biases)
                 self.sequencer.push(measurement)
 
     def advance(self, now_ns: int) -> Iterator[Tick]:

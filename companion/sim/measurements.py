@@ -52,7 +52,7 @@ class MeasuredWalk:
     inertial: list[ImuSample | Attitude]
 
     def in_order(self) -> list[Measurement]:
-        """All measurements in stamp order; of one instant the inertial and increment first, landmarks last."""
+        """All measurements in stamp order; of one instant inertial first, then increment, landmarks last."""
         every: list[Measurement] = [*self.inertial, *self.increments]
         every += [*self.range_frames, *self.landmark_frames]
         return sorted(every, key=lambda measurement: measurement.stamp_ns)

@@ -1,0 +1,171 @@
+"""Range biases against known positions: a line over the distance for each anchor, with its uncertainty."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from estimators.messages import FloatArray, RangeFrame
+from estimators.models.range_bias import RangeBias
+
+SPEED_OF_LIGHT = 299_792_458.0
+"""[m/s]."""
+MIN_SPREAD = 0.5
+"""Least standard deviation of the distances [m] with which growth over the distance is looked for."""
+MIN_RANGES = 20
+"""Fewer ranges than this are no calibration of an anchor."""
+_TRIM = 3.0
+_ROUNDS = 20
+_BLOCK = 1.0
+"""Errors within a time like this [s] are alike; those further apart are taken for independent."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Ranges:
+    """Ranges of one anchor beside the true distances.
+
+    Attributes:
+        times: (N,) [s] since the beginning of the log.
+        measured: (N,) [m].
+        distances: (N,) true [m], slant.
+    """
+
+    times: FloatArray
+    measured: FloatArray
+    distances: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AnchorFit:
+    """Bias of one anchor's ranges.
+
+    Attributes:
+        bias: of the line.
+        constant_sigma: standard deviation of `bias.constant` [m].
+        per_metre_sigma: standard deviation of `bias.per_metre`; 0 when it was not looked for.
+        used: ranges that the line was laid through.
+        ranges: of the anchor, all of them.
+    """
+
+    bias: RangeBias
+    constant_sigma: float
+    per_metre_sigma: float
+    used: int
+    ranges: Ranges
+
+    def residuals(self, calibrated: bool) -> FloatArray:
+        """Measured or corrected range minus distance, (N,) [m]."""
+        ranges = self.ranges
+        if not calibrated:
+            return ranges.measured - ranges.distances
+        return np.array([self.bias.corrected(r) for r in ranges.measured.tolist()]) - ranges.distances
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Calibration:
+    """Biases of all anchors.
+
+    Attributes:
+        common: mean of the anchors' biases, r_D of chen2019 [m].
+        common_sigma: its standard deviation [m].
+        anchors: anchor id -> fit.
+    """
+
+    common: float
+    common_sigma: float
+    anchors: dict[int, AnchorFit]
+
+    @property
+    def common_ns(self) -> float:
+        """The common bias as a time [ns]."""
+        return self.common / SPEED_OF_LIGHT * 1e9
+
+
+def ranges_by_anchor(
+    frames: list[RangeFrame], tags: FloatArray, anchors: Mapping[int, FloatArray], start_ns: int
+) -> dict[int, Ranges]:
+    """Ranges and true distances of every anchor of the site.
+
+    Args:
+        frames: N, as measured.
+        tags: (N, 3) true positions of the tag [m], map frame; NaN where they are not known.
+        anchors: id -> (3,) position [m].
+        start_ns: beginning of the log.
+    """
+    rows: dict[int, list[tuple[float, float, float]]] = {i: [] for i in anchors}
+    for frame, tag in zip(frames, tags, strict=True):
+        if not np.isfinite(tag).all():
+            continue
+        time = (frame.stamp_ns - start_ns) * 1e-9
+        for anchor_id, measured in zip(frame.anchor_ids.tolist(), frame.ranges.tolist(), strict=True):
+            if anchor_id in anchors and 0.0 < measured < np.inf:
+                distance = float(np.linalg.norm(tag - anchors[anchor_id]))
+                rows[anchor_id].append((time, measured, distance))
+    return {i: Ranges(*np.array(found).T) for i, found in rows.items() if len(found) >= MIN_RANGES}
+
+
+def fit_biases(by_anchor: Mapping[int, Ranges]) -> Calibration:
+    """Biases of anchors, each from its own ranges.
+
+    Args:
+        by_anchor: anchor id -> at least `MIN_RANGES` ranges; one anchor at least.
+
+    Source: chen2019 section 1.1: mean of measured minus true distance in line of sight, fitted over it.
+    """
+    fits = {anchor_id: fit_anchor(ranges) for anchor_id, ranges in by_anchor.items()}
+    return together(fits)
+
+
+def together(fits: dict[int, AnchorFit]) -> Calibration:
+    """Calibration of anchors whose fits are independent of each other."""
+    sigmas = [fit.constant_sigma for fit in fits.values()]
+    return Calibration(
+        common=float(np.mean([fit.bias.constant for fit in fits.values()])),
+        common_sigma=float(np.sqrt(np.sum(np.square(sigmas)))) / len(fits),
+        anchors=fits,
+    )
+
+
+def fit_anchor(ranges: Ranges) -> AnchorFit:
+    """Line through an anchor's errors over the distance, blocked and failed ranges left out.
+
+    What is further from the line than three robust standard deviations (median absolute deviation) is left
+    out, and the line laid again until nothing changes. The uncertainty is that of errors which are alike
+    within a second (cluster-robust).
+
+    Source: line and trimming: standard least squares; covariance: Liang and Zeger, Biometrika 73(1), 1986.
+    """
+    errors = ranges.measured - ranges.distances
+    centre = float(ranges.distances.mean())
+    design = np.ones((len(errors), 1))
+    if ranges.distances.std() >= MIN_SPREAD:
+        design = np.column_stack([design, ranges.distances - centre])
+    line = np.zeros(design.shape[1])
+    line[0] = np.median(errors)
+    kept = np.ones(len(errors), dtype=bool)
+    for _ in range(_ROUNDS):
+        off = np.abs(errors - design @ line)
+        # A hair more than nothing: exact ranges have no spread at all.
+        kept_now = off <= _TRIM * 1.4826 * float(np.median(off)) + 1e-9
+        line = np.linalg.lstsq(design[kept_now], errors[kept_now], rcond=None)[0]
+        if (kept_now == kept).all():
+            break
+        kept = kept_now
+    cov = _clustered_covariance(design[kept], (errors - design @ line)[kept], ranges.times[kept])
+    sigmas = np.sqrt(np.diag(cov))
+    has_slope = len(line) == 2
+    return AnchorFit(
+        RangeBias(float(line[0]), float(line[1]) if has_slope else 0.0, centre),
+        float(sigmas[0]),
+        float(sigmas[1]) if has_slope else 0.0,
+        int(kept.sum()),
+        ranges,
+    )
+
+
+def _clustered_covariance(design: FloatArray, residuals: FloatArray, times: FloatArray) -> FloatArray:
+    blocks = np.unique((times / _BLOCK).astype(np.int64), return_inverse=True)[1]
+    scores = np.zeros((int(blocks.max()) + 1, design.shape[1]))
+    np.add.at(scores, blocks, design * residuals[:, None])
+    bread = np.linalg.pinv(design.T @ design)
+    return np.asarray(bread @ (scores.T @ scores) @ bread)
