@@ -6,12 +6,16 @@ from typing import Annotated
 
 import numpy as np
 import typer
+from rich import box
 from rich.console import Console
 from rich.table import Table
 
 from companion.calibration.ranges import Calibration
 from companion.config import Config, load_config
 from companion.errors import UserError
+
+MAX_SPREAD, MIN_USED_SHARE = 0.2, 0.8
+"""An anchor whose used errors scatter more than this [m], or with a smaller share used, was hidden."""
 
 app = typer.Typer(
     help="Find out from a drive what the sensors do wrong.", no_args_is_help=True, rich_markup_mode="rich"
@@ -80,6 +84,12 @@ def ranges(
         found = fit_biases(by_anchor)
     out = Console(highlight=False)
     out.print(_range_table(found, config))
+    for anchor_id in _badly_seen(found):
+        Console(stderr=True, highlight=False).print(
+            f"[yellow]anchor {anchor_id}: its errors scatter too much for noise, something stood before it; "
+            "calibrate in line of sight[/]",
+            soft_wrap=True,
+        )
     residual_figure(found, picture, f"{config.site.name}: ranges of {log.name}")
     write_range_bias(site, found, to or site)
     out.print(f"  common bias {found.common:+.4f} +- {found.common_sigma:.4f} m, {found.common_ns:+.2f} ns")
@@ -88,12 +98,64 @@ def ranges(
     _write_json(figures, _range_figures(found))
 
 
+@app.command()
+def mounting(log: Log_, site: Site, until: Until = None, figures: Json = None) -> None:
+    """Find where the UWB tag sits on the robot and how late its ranges are stamped, against the LiDAR.
+
+    The drive must turn, both ways best: what a turn does not show of the tag's place, nothing shows. Range
+    biases are found along with it. Nothing is written: compare with a ruler before you change the site file.
+    """
+    from companion.calibration.drive import mounting_on_drive
+    from companion.calibration.recording import read_recording
+    from companion.log import Log
+
+    config = load_config(site)
+    found = mounting_on_drive(read_recording(Log(log), config, until), config)
+    table = Table(title=f"{config.site.name}: UWB tag against LiDAR", title_justify="left")
+    for heading in ("", "site", "found", "sigma", "unit"):
+        table.add_column(heading, justify="right" if heading else "left")
+    for i, axis in enumerate("xy"):
+        row = (f"{config.body.tag[i]:.3f}", f"{found.arm[i]:.3f}", f"{found.arm_sigma[i]:.3f}", "m")
+        table.add_row(f"body.tag {axis}", *row)
+    delay = (f"{found.delay * 1e3:.1f}", f"{found.delay_sigma * 1e3:.1f}", "ms")
+    table.add_row("ranges stamped late by", "0.0", *delay)
+    out = Console(highlight=False)
+    out.print(table)
+    sensor = "UWB" if found.delay >= 0.0 else "LiDAR"
+    out.print(
+        f"  to take the delay off: add {abs(found.delay) * 1e3:.1f} to latency_ms of the {sensor} sensor"
+    )
+    _write_json(
+        figures,
+        {
+            "tag_m": found.arm,
+            "tag_sigma_m": found.arm_sigma,
+            "delay_s": found.delay,
+            "delay_sigma_s": found.delay_sigma,
+        },
+    )
+
+
+def _badly_seen(found: Calibration) -> list[int]:
+    """Anchors whose errors scatter more than noise does, or of whose ranges many were left out."""
+    return [
+        anchor_id
+        for anchor_id, fit in found.anchors.items()
+        if fit.spread > MAX_SPREAD or fit.used < MIN_USED_SHARE * len(fit.ranges.measured)
+    ]
+
+
 def _range_table(found: Calibration, config: Config) -> Table:
-    table = Table(title=f"{config.site.name}: range minus distance", title_justify="left")
+    table = Table(
+        title=f"{config.site.name}: range minus distance",
+        title_justify="left",
+        box=box.SIMPLE_HEAD,
+        padding=(0, 1, 0, 0),
+    )
     for heading in ("anchor", "bias\nm", "sigma\nm", "at\nm", "per metre\nm/m", "sigma\nm/m"):
         table.add_column(heading, justify="right")
-    for heading in ("RMS before\nm", "RMS after\nm", "ranges\nused / all"):
-        table.add_column(heading, justify="right")
+    for heading in ("RMS\nbefore", "RMS\nafter", "used", "of"):
+        table.add_column(heading, justify="right", no_wrap=True)
     for anchor_id in config.anchors:
         fit = found.anchors.get(anchor_id)
         if fit is None:
@@ -109,7 +171,8 @@ def _range_table(found: Calibration, config: Config) -> Table:
             f"{fit.per_metre_sigma:.4f}" if fit.per_metre_sigma else "-",
             f"{before:.3f}",
             f"{after:.3f}",
-            f"{fit.used} / {len(fit.ranges.measured)}",
+            str(fit.used),
+            str(len(fit.ranges.measured)),
         )
     return table
 

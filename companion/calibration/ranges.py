@@ -14,7 +14,7 @@ MIN_SPREAD = 0.5
 """Least standard deviation of the distances [m] with which growth over the distance is looked for."""
 MIN_RANGES = 20
 """Fewer ranges than this are no calibration of an anchor."""
-_TRIM = 3.0
+_TRIM = _SIGNIFICANT = 3.0
 _ROUNDS = 20
 _BLOCK = 1.0
 """Errors within a time like this [s] are alike; those further apart are taken for independent."""
@@ -43,6 +43,7 @@ class AnchorFit:
         bias: of the line.
         constant_sigma: standard deviation of `bias.constant` [m].
         per_metre_sigma: standard deviation of `bias.per_metre`; 0 when it was not looked for.
+        spread: standard deviation of the errors about the line, of the ranges used [m].
         used: ranges that the line was laid through.
         ranges: of the anchor, all of them.
     """
@@ -50,6 +51,7 @@ class AnchorFit:
     bias: RangeBias
     constant_sigma: float
     per_metre_sigma: float
+    spread: float
     used: int
     ranges: Ranges
 
@@ -129,24 +131,35 @@ def together(fits: dict[int, AnchorFit]) -> Calibration:
 def fit_anchor(ranges: Ranges) -> AnchorFit:
     """Line through an anchor's errors over the distance, blocked and failed ranges left out.
 
-    What is further from the line than three robust standard deviations (median absolute deviation) is left
-    out, and the line laid again until nothing changes. The uncertainty is that of errors which are alike
+    Growth with the distance is taken where it is three standard deviations from none; else the line is level:
+    a growth that noise made would do harm at distances that the drive did not have.
+
+    It begins at the mode of the errors. What is further from the line than `trim_limit` is left out, and the
+    line laid again until nothing changes. The uncertainty is that of errors which are alike
     within a second (cluster-robust).
 
     Source: line and trimming: standard least squares; covariance: Liang and Zeger, Biometrika 73(1), 1986.
     """
-    errors = ranges.measured - ranges.distances
     centre = float(ranges.distances.mean())
-    design = np.ones((len(errors), 1))
+    level = np.ones((len(ranges.distances), 1))
     if ranges.distances.std() >= MIN_SPREAD:
-        design = np.column_stack([design, ranges.distances - centre])
+        sloping = _fit_line(ranges, np.column_stack([level, ranges.distances - centre]), centre)
+        if abs(sloping.bias.per_metre) > _SIGNIFICANT * sloping.per_metre_sigma:
+            return sloping
+    return _fit_line(ranges, level, centre)
+
+
+def _fit_line(ranges: Ranges, design: FloatArray, centre: float) -> AnchorFit:
+    errors = ranges.measured - ranges.distances
     line = np.zeros(design.shape[1])
-    line[0] = np.median(errors)
+    line[0] = half_sample_mode(errors)
     kept = np.ones(len(errors), dtype=bool)
+    limit = np.inf
     for _ in range(_ROUNDS):
-        off = np.abs(errors - design @ line)
-        # A hair more than nothing: exact ranges have no spread at all.
-        kept_now = off <= _TRIM * 1.4826 * float(np.median(off)) + 1e-9
+        off = errors - design @ line
+        # Never wider than before: else blocked ranges lift the line, which lets in more of them.
+        limit = min(limit, trim_limit(off))
+        kept_now = np.abs(off) <= limit
         line = np.linalg.lstsq(design[kept_now], errors[kept_now], rcond=None)[0]
         if (kept_now == kept).all():
             break
@@ -158,9 +171,35 @@ def fit_anchor(ranges: Ranges) -> AnchorFit:
         RangeBias(float(line[0]), float(line[1]) if has_slope else 0.0, centre),
         float(sigmas[0]),
         float(sigmas[1]) if has_slope else 0.0,
+        float((errors - design @ line)[kept].std()),
         int(kept.sum()),
         ranges,
     )
+
+
+def trim_limit(errors: FloatArray) -> float:
+    """Size [m] above which an error is no noise: three standard deviations, judged by the negative errors.
+
+    What blocks a range only lengthens it, so ranges that came straight are those on the short side.
+    """
+    short = -errors[errors <= 0.0]
+    spread = float(np.median(short)) if len(short) else 0.0
+    # A hair more than nothing: exact ranges have no spread at all.
+    return _TRIM * 1.4826 * spread + 1e-6
+
+
+def half_sample_mode(values: FloatArray) -> float:
+    """Where values (N,) lie closest together: halved again and again to the densest half.
+
+    Source: Bickel and Fruehwirth, Computational Statistics and Data Analysis 50(12), 2006.
+    """
+    values = np.sort(values)
+    while len(values) > 3:
+        half = (len(values) + 1) // 2
+        widths = values[half - 1 :] - values[: len(values) - half + 1]
+        begin = int(np.argmin(widths))
+        values = values[begin : begin + half]
+    return float(values.mean())
 
 
 def _clustered_covariance(design: FloatArray, residuals: FloatArray, times: FloatArray) -> FloatArray:
