@@ -193,13 +193,12 @@ def half_sample_mode(values: FloatArray) -> float:
 
     Source: Bickel and Fruehwirth, Computational Statistics and Data Analysis 50(12), 2006.
     """
-    values = np.sort(values)
-    while len(values) > 3:
-        half = (len(values) + 1) // 2
-        widths = values[half - 1 :] - values[: len(values) - half + 1]
-        begin = int(np.argmin(widths))
-        values = values[begin : begin + half]
-    return float(values.mean())
+    ascending = np.sort(values).tolist()
+    while len(ascending) > 3:
+        half = (len(ascending) + 1) // 2
+        begin = int(np.argmin(np.subtract(ascending[half - 1 :], ascending[: len(ascending) - half + 1])))
+        ascending = ascending[begin : begin + half]
+    return float(np.mean(ascending))
 
 
 def _clustered_covariance(design: FloatArray, residuals: FloatArray, times: FloatArray) -> FloatArray:

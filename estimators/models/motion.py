@@ -78,4 +78,5 @@ def constant_acceleration(dt: float, jerk_noise: float) -> tuple[FloatArray, Flo
             [step**3 / 6.0, sign * step**2 / 2.0, step],
         ]
     )
-    return F, np.kron(by_axis, np.eye(2))
+    Q: FloatArray = np.kron(by_axis, np.eye(2)).astype(np.float64)
+    return F, Q

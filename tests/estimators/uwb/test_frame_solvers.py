@@ -92,7 +92,7 @@ def test_covariance_is_that_of_the_errors(name: str, dimensions: int) -> None:
         assert fix is not None
         error = (fix.position - tag)[:dimensions]
         squares.append(error @ np.linalg.solve(fix.cov[:dimensions, :dimensions], error))
-    low, high = chi2.ppf([1e-3, 1 - 1e-3], 300 * dimensions)
+    low, high = chi2.ppf(1e-3, 300 * dimensions), chi2.ppf(1 - 1e-3, 300 * dimensions)
     assert low < sum(squares) < high
 
 

@@ -38,7 +38,8 @@ def problem(rng: np.random.Generator, dimensions: int) -> tuple[FloatArray, Floa
 
 def optimum(anchors: FloatArray, ranges: FloatArray, start: FloatArray) -> FloatArray:
     def residuals(p: FloatArray) -> FloatArray:
-        return np.linalg.norm(anchors - p, axis=1) - ranges
+        distances: FloatArray = np.linalg.norm(anchors - p, axis=1)
+        return distances - ranges
 
     found = least_squares(residuals, start, xtol=1e-14, ftol=1e-14, gtol=1e-14)
     return np.asarray(found.x)
