@@ -151,7 +151,7 @@ def fit_anchor(ranges: Ranges) -> AnchorFit:
 
 def _fit_line(ranges: Ranges, design: FloatArray, centre: float) -> AnchorFit:
     errors = ranges.measured - ranges.distances
-    line = np.zeros(design.shape[1])
+    line: FloatArray = np.zeros(design.shape[1])
     line[0] = half_sample_mode(errors)
     kept = np.ones(len(errors), dtype=bool)
     limit = np.inf

@@ -110,7 +110,8 @@ def test_exact_measurements_leave_no_error_of_pose_and_heading() -> None:
 
 
 def test_the_inertial_sensor_makes_the_position_better_and_heading_known() -> None:
-    with_imu, without = [], []
+    with_imu: list[float] = []
+    without: list[float] = []
     for seed in range(3):
         for imu, into in ((True, with_imu), (False, without)):
             circle = Circle(seed)
@@ -124,8 +125,8 @@ def test_pose_and_heading_are_as_uncertain_as_claimed() -> None:
     nees = []
     for seed in range(10):
         circle = Circle(seed)
-        config = {"imu_accel_sigma": 0.05, "jerk_noise": 1.0, "heading_walk_deg": 0.0, "bias_walk": 0.0}
-        errors, covs, _ = followed(plain(**config), circle, circle.stream(12.0))
+        estimator = plain(imu_accel_sigma=0.05, jerk_noise=1.0, heading_walk_deg=0.0, bias_walk=0.0)
+        errors, covs, _ = followed(estimator, circle, circle.stream(12.0))
         late = slice(len(errors) // 3, None, 20)
         nees += np.einsum("ni,nij,nj->n", errors[late], np.linalg.inv(covs[late]), errors[late]).tolist()
     # Instants seconds apart still share the heading's error: each walk counts as one sample.
@@ -134,7 +135,7 @@ def test_pose_and_heading_are_as_uncertain_as_claimed() -> None:
 
 
 def test_bursts_move_the_adaptive_filter_much_less() -> None:
-    worst = {"plain": [], "adaptive": []}  # type: dict[str, list[float]]
+    worst: dict[str, list[float]] = {"plain": [], "adaptive": []}
     for seed in range(3):
         for name, estimator in (("plain", plain()), ("adaptive", adaptive())):
             circle = Circle(seed)
