@@ -160,7 +160,7 @@ def _fit_line(ranges: Ranges, design: FloatArray, centre: float) -> AnchorFit:
         # Never wider than before: else blocked ranges lift the line, which lets in more of them.
         limit = min(limit, trim_limit(off))
         kept_now = np.abs(off) <= limit
-        line = np.linalg.lstsq(design[kept_now], errors[kept_now], rcond=None)[0]
+        line[:] = np.linalg.lstsq(design[kept_now], errors[kept_now], rcond=None)[0]
         if (kept_now == kept).all():
             break
         kept = kept_now

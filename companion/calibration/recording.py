@@ -33,7 +33,7 @@ def read_recording(log: Log, config: Config, until: float | None) -> Recording:
     Args:
         log: to read.
         config: of the site.
-        until: leave out what comes later than this after the beginning [s]; None: take all.
+        until: leave out what arrived later than this after the beginning [s]; None: take all.
 
     Raises:
         UserError: there is no range in it.
@@ -41,13 +41,11 @@ def read_recording(log: Log, config: Config, until: float | None) -> Recording:
     end_ns = None if until is None else log.start_ns + round(until * 1e9)
     recording = Recording(log.start_ns, [], [], [])
     front_end, _ = make_parts(config, [])
-    for measurement in _measurements(log, config):
+    for measurement in _measurements(log, config, end_ns):
         if isinstance(measurement, Scan):
             increment = front_end.update(measurement)
-            if increment is not None and (end_ns is None or increment.stamp_ns <= end_ns):
+            if increment is not None:
                 recording.increments.append(increment)
-        elif end_ns is not None and measurement.stamp_ns > end_ns:
-            continue
         elif isinstance(measurement, Truth):
             recording.truths.append(measurement)
         elif isinstance(measurement, RangeFrame):
@@ -59,9 +57,11 @@ def read_recording(log: Log, config: Config, until: float | None) -> Recording:
     return recording
 
 
-def _measurements(log: Log, config: Config) -> Iterator[Measurement | Truth]:
+def _measurements(log: Log, config: Config, end_ns: int | None) -> Iterator[Measurement | Truth]:
     sensors = make_sensors(config)
     for record in log:
+        if end_ns is not None and record.stamp_ns > end_ns:
+            return
         if isinstance(record, Truth):
             yield record
         elif record.direction is Direction.IN and record.source in sensors:
