@@ -67,7 +67,7 @@ def ranges(
     from companion.log import Log
 
     config = load_config(site)
-    recording = read_recording(Log(log), config, until)
+    recording = read_recording(Log(log), config, until, with_odometry=against == "lidar")
     if against == "lidar":
         from companion.calibration.drive import calibrate_on_drive
 
@@ -110,7 +110,7 @@ def mounting(log: Log_, site: Site, until: Until = None, figures: Json = None) -
     from companion.log import Log
 
     config = load_config(site)
-    found = mounting_on_drive(read_recording(Log(log), config, until), config)
+    found = mounting_on_drive(read_recording(Log(log), config, until, with_odometry=True), config)
     table = Table(title=f"{config.site.name}: UWB tag against LiDAR", title_justify="left")
     for heading in ("", "site", "found", "sigma", "unit"):
         table.add_column(heading, justify="right" if heading else "left")

@@ -27,13 +27,14 @@ class Recording:
     truths: list[Truth]
 
 
-def read_recording(log: Log, config: Config, until: float | None) -> Recording:
+def read_recording(log: Log, config: Config, until: float | None, with_odometry: bool) -> Recording:
     """Decode a log.
 
     Args:
         log: to read.
         config: of the site.
         until: leave out what arrived later than this after the beginning [s]; None: take all.
+        with_odometry: match the scans, too.
 
     Raises:
         UserError: there is no range in it.
@@ -43,7 +44,7 @@ def read_recording(log: Log, config: Config, until: float | None) -> Recording:
     front_end, _ = make_parts(config, [])
     for measurement in _measurements(log, config, end_ns):
         if isinstance(measurement, Scan):
-            increment = front_end.update(measurement)
+            increment = front_end.update(measurement) if with_odometry else None
             if increment is not None:
                 recording.increments.append(increment)
         elif isinstance(measurement, Truth):
