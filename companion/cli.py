@@ -20,6 +20,7 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 from typer.core import TyperGroup
 
 from companion import __version__
+from companion.calibrate_cli import app as calibrate_app
 from companion.doctor import app as doctor
 from companion.errors import UserError
 from companion.evaluate_cli import app as evaluate_app
@@ -57,6 +58,7 @@ app = typer.Typer(
 )
 app.add_typer(doctor, name="doctor")
 app.add_typer(params_app, name="params")
+app.add_typer(calibrate_app, name="calibrate")
 app.command()(sitl)
 app.add_typer(evaluate_app, name="evaluate", cls=_ScenarioUnlessNamed)
 app.command()(smooth)

@@ -29,6 +29,7 @@ from estimators.base import Setup, Start
 from estimators.lidar.scan_matching import ScanMatcher
 from estimators.lidar.scan_preparation import ScanPreparation
 from estimators.messages import FloatArray
+from estimators.models.range_bias import RangeBias
 from estimators.relocation.recovery import Recovering
 from estimators.trilateration import AnchorGeometryError, check_anchor_geometry
 
@@ -113,6 +114,24 @@ class StartTable(Table):
         yaw, yaw_sigma = np.deg2rad([self.yaw_deg, self.sigma_yaw_deg])
         pose = np.array([self.x, self.y, yaw])
         return Start(pose, np.array([self.sigma_xy, self.sigma_xy, yaw_sigma]), self.still_for)
+
+
+class AnchorBiasTable(Table):
+    """How much longer than the common bias one anchor's ranges are, as `companion calibrate ranges` found."""
+
+    constant: float = Field(0.0, ge=-10, le=10, description="beyond the common bias, at `distance` [m]")
+    constant_sigma: float = Field(0.0, ge=0, le=10, description="standard deviation of it [m]")
+    per_metre: float = Field(0.0, ge=-0.2, le=0.2, description="growth with the distance [m/m]")
+    per_metre_sigma: float = Field(0.0, ge=0, le=1, description="standard deviation of it [m/m]")
+    distance: float = Field(0.0, ge=0, le=1000, description="where `constant` holds [m]")
+
+
+class RangeBiasTable(Table):
+    """What is taken off every range before anything else uses it."""
+
+    common: float = Field(0.0, ge=-10, le=10, description="of all anchors: c times the time bias [m]")
+    common_sigma: float = Field(0.0, ge=0, le=10, description="standard deviation of it [m]")
+    anchors: dict[int, AnchorBiasTable] = Field({}, description="by the id of the anchor")
 
 
 class SensorTable(Table):
@@ -200,6 +219,7 @@ class Config(Table):
     body: BodyTable = Field(default_factory=BodyTable)
     start: StartTable
     sensor: dict[str, SensorTable] = Field(min_length=1)
+    range_bias: RangeBiasTable = Field(default_factory=RangeBiasTable)
     pipeline: PipelineTable = Field(default_factory=PipelineTable)
     scan_preparation: ScanPreparation.Config = Field(default_factory=ScanPreparation.Config)
     scan_matcher: ScanMatcher.Config = Field(default_factory=ScanMatcher.Config)
@@ -273,6 +293,17 @@ class Config(Table):
             walls=[np.array(wall) for wall in self.site.walls],
             lidar_in_body=self.lidar_mounting(),
         )
+
+    def range_biases(self) -> dict[int, RangeBias]:
+        """Bias by anchor id; empty when none is known."""
+        table = self.range_bias
+        if not table.common and not table.anchors:
+            return {}
+        single = {i: table.anchors.get(i, AnchorBiasTable()) for i in self.anchors}
+        return {
+            i: RangeBias(table.common + bias.constant, bias.per_metre, bias.distance)
+            for i, bias in single.items()
+        }
 
     def lidar_mounting(self) -> FloatArray:
         """`T_body_lidar`, (3,): x [m], y [m], yaw [rad] in the body frame."""

@@ -98,10 +98,10 @@ def scenario(
     """
     from companion.config import named_file
     from companion.evaluation import DEFAULT_CHOICES, evaluate_scenario
-    from companion.evaluation_table import evaluation_notes, evaluation_table, trust_table
+    from companion.evaluation_table import evaluation_notes, evaluation_table, leg_table, trust_table
     from companion.log_trial import LOG_SUFFIX
 
-    out, err = Console(), Console(stderr=True, highlight=False, soft_wrap=True)
+    out, err = Console(emoji=False), Console(stderr=True, highlight=False, soft_wrap=True, emoji=False)
     if not out.is_terminal:
         out.width = max(out.width, _TABLE_WIDTH)
     choices = DEFAULT_CHOICES if estimators is None else estimators.split(",")
@@ -132,6 +132,8 @@ def scenario(
         result = results[-1]
         out.print(evaluation_table(result))
         out.print(trust_table(result))
+        if (legs := leg_table(result)) is not None:
+            out.print(legs)
         for line in evaluation_notes(result):
             out.print(f"  {line}", highlight=False, soft_wrap=True)
         if folder is not None:

@@ -19,6 +19,7 @@ from companion.errors import UserError
 from companion.estimator_choice import chosen_settings, split_choice
 from companion.evaluate import Errors
 from companion.fault_trial import run_fault_trial
+from companion.legs import LegFigures
 from companion.log_edit.faults import parse_fault
 from companion.log_trial import LOG_SUFFIX, log_config, run_log_trial
 from companion.metrics import chi2_mean_bounds
@@ -79,6 +80,8 @@ class MeanFigures:
     first_fix_s: float | None
     integrity: float | None
     epoch_bound_ratio: float | None
+    iterations: float | None
+    legs: dict[str, LegFigures]
 
 
 @dataclass(frozen=True, slots=True)
@@ -287,7 +290,21 @@ def _mean(results: list[TrialFigures | None]) -> MeanFigures | None:
         first_fix_s=mean_if_known("first_fix_s"),
         integrity=float(np.mean(integrities)) if integrities else None,
         epoch_bound_ratio=mean_if_known("epoch_bound_ratio"),
+        iterations=mean_if_known("iterations"),
+        legs=_mean_legs([each.legs for each in figures]),
     )
+
+
+def _mean_legs(trials: list[dict[str, LegFigures]]) -> dict[str, LegFigures]:
+    """Means over trials on the legs that every trial has figures for."""
+    names = [name for name in trials[0] if all(name in legs for legs in trials)]
+    return {
+        name: LegFigures(
+            rmse_m=float(np.mean([legs[name].rmse_m for legs in trials])),
+            max_m=float(np.mean([legs[name].max_m for legs in trials])),
+        )
+        for name in names
+    }
 
 
 _ALWAYS_KNOWN = (

@@ -6,7 +6,8 @@ from rich import box
 from rich.table import Table
 
 from companion.evaluation import Evaluation, MeanFigures
-from companion.sim.scenario_tables import PaperFigures
+from companion.legs import LegFigures
+from companion.sim.scenario_tables import PaperFigures, PaperLeg
 
 _PAPER = "  paper"
 _ERRORS = ("RMSE\nm", "\nx", "\ny", "max\nm", "\nx", "\ny", "yaw\ndeg")
@@ -21,6 +22,8 @@ _TRUST = (
     "first fix\ns",
     "beyond 3 sigma\n% of healthy",
 )
+
+_LEGS = "legs: RMSE / max [m]"
 
 
 def evaluation_table(result: Evaluation) -> Table:
@@ -41,10 +44,10 @@ def markdown(result: Evaluation, pictures: Sequence[str] = ()) -> str:
         pictures: names of files beside the text.
     """
     parts = [f"## {_title(result)}", ""]
-    for headings, rows in (
-        ((*_ERRORS, *_CONSISTENCY), accuracy_rows(result)),
-        (_TRUST, trust_rows(result)),
-    ):
+    tables = [((*_ERRORS, *_CONSISTENCY), accuracy_rows(result)), (_TRUST, trust_rows(result))]
+    if legs := _leg_names(result):
+        tables.append((tuple(f"{name}, RMSE / max m" for name in legs), leg_rows(result)))
+    for headings, rows in tables:
         cells = ["estimator", *(heading.replace("\n", " ").strip() for heading in headings)]
         parts += [_line(cells), _line(["---", *["---:"] * len(headings)])]
         parts += [_line([*row, *[""] * (len(cells) - len(row))]) for row in rows]
@@ -52,6 +55,12 @@ def markdown(result: Evaluation, pictures: Sequence[str] = ()) -> str:
     parts += [f"- {note}" for note in evaluation_notes(result)]
     parts += ["", *(f"![{result.scenario}]({name})" for name in pictures), ""]
     return "\n".join(parts)
+
+
+def leg_table(result: Evaluation) -> Table | None:
+    """RMSE and largest error on every named leg, published figures below ours; None without such legs."""
+    names = _leg_names(result)
+    return _table(_LEGS, names, leg_rows(result)) if names else None
 
 
 def evaluation_notes(result: Evaluation) -> list[str]:
@@ -75,11 +84,17 @@ def evaluation_notes(result: Evaluation) -> list[str]:
             f"{name}: within 0.3 m and 10 deg to the end {median} (median); within 5 s of motion in "
             f"{found['within_5_s']} of {result.trials} trials"
         )
-    return notes + [
+    notes += [
         _range_note(name, figures.ranges)
         for name, figures in result.estimators.items()
         if figures and figures.ranges and figures.ranges["biased"]
     ]
+    notes += [
+        f"{name}: {mean.iterations:.1f} iterations of its solver for a frame"
+        for name, mean in result.estimators.items()
+        if mean is not None and mean.iterations is not None
+    ]
+    return notes
 
 
 def _range_note(name: str, ranges: Mapping[str, float | int | None]) -> str:
@@ -114,6 +129,24 @@ def trust_rows(result: Evaluation) -> list[list[str]]:
         [name, *(_trust_cells(figures) if figures else ["none"])]
         for name, figures in result.estimators.items()
     ]
+
+
+def leg_rows(result: Evaluation) -> list[list[str]]:
+    """Name of every estimator and its errors on each named leg, the paper's row after ours."""
+    names = _leg_names(result)
+    published = result.paper.estimators if result.paper else {}
+    rows = []
+    for choice, figures in result.estimators.items():
+        ours = figures.legs if figures else {}
+        rows.append([choice, *(_leg_cell(ours.get(name)) for name in names)])
+        if choice in published and published[choice].legs:
+            stated = published[choice].legs
+            rows.append([_PAPER, *(_leg_cell(stated.get(name)) for name in names)])
+    return rows
+
+
+def _leg_names(result: Evaluation) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(leg for mean in result.estimators.values() if mean for leg in mean.legs))
 
 
 def _title(result: Evaluation) -> str:
@@ -166,6 +199,12 @@ def _trust_cells(figures: MeanFigures) -> list[str]:
 def _paper_cells(figures: PaperFigures) -> list[str]:
     stated = [getattr(figures, key, None) for key in _POSITION]
     return ["" if value is None else _short(value, 3) for value in stated]
+
+
+def _leg_cell(figures: LegFigures | PaperLeg | None) -> str:
+    if figures is None or (figures.rmse_m is None and figures.max_m is None):
+        return ""
+    return " / ".join("-" if v is None else _short(v, 3) for v in (figures.rmse_m, figures.max_m))
 
 
 _POSITION = ("rmse_m", "rmse_x_m", "rmse_y_m", "max_m", "max_x_m", "max_y_m")

@@ -23,6 +23,7 @@ from estimators import make_estimator
 from estimators.base import Estimator, Report
 from estimators.lidar.scan_matching import ScanMatcher
 from estimators.messages import Measurement, PoseEstimate, PoseIncrement, RangeFrame, Scan
+from estimators.models.range_bias import without_bias
 
 
 class FrontEnd(Protocol):
@@ -113,6 +114,7 @@ class Chain:
         self._pipeline = pipeline
         self._primary = primary
         self._monitor = make_monitor(config, self.sensors)
+        self._range_biases = config.range_biases()
         self._start_ns = start_ns
         self._period_ns = 1e9 / config.pipeline.rate
         self._ticks = 0
@@ -132,6 +134,9 @@ class Chain:
         decoder = self._decoders.get(chunk.source)
         if decoder is not None and chunk.direction is Direction.IN:
             for measurement in decoder.feed(chunk.data, chunk.stamp_ns):
+                # Here once, so that logs stay as measured and replay takes off what it is told to.
+                if isinstance(measurement, RangeFrame):
+                    measurement = without_bias(measurement, self._range_biases)
                 self.sequencer.push(measurement)
 
     def set_health(self, table: HealthTable) -> None:

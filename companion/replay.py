@@ -6,6 +6,7 @@ from collections import Counter, defaultdict
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from statistics import fmean
 
 from scipy.spatial.transform import Rotation
 
@@ -88,6 +89,7 @@ class Replay:
         verdicts: estimator -> how often each verdict was given to a range or increment.
         anchor_verdicts: estimator -> anchor -> the same of its ranges.
         range_lines: lines of `ranges.csv`, of the primary.
+        iterations: estimator -> steps of its solver for each frame; empty without such a solver.
         health: state -> number of ticks.
         sensors: sensor -> what its decoder counted.
         late: measurements that came too late to be used.
@@ -103,6 +105,7 @@ class Replay:
     verdicts: dict[str, Counter[str]] = field(default_factory=dict)
     anchor_verdicts: dict[str, dict[int, Counter[str]]] = field(default_factory=dict)
     range_lines: list[str] = field(default_factory=list)
+    iterations: dict[str, list[int]] = field(default_factory=dict)
     health: Counter[str] = field(default_factory=Counter)
     sensors: dict[str, DecodeStats] = field(default_factory=dict)
     late: int = 0
@@ -148,6 +151,7 @@ def replay(
     result.update_times = {name: Stopwatch() for name in ["scan_matcher", *names]}
     result.verdicts = {name: Counter() for name in names}
     result.anchor_verdicts = {name: defaultdict(Counter) for name in names}
+    result.iterations = {name: [] for name in names}
     chain = Chain(config, begin_ns, _timed_pipeline(config, names, result.update_times), names[0])
     truths: list[Truth] = []
     ticks_ns: list[int] = []
@@ -165,6 +169,8 @@ def replay(
                 for name, report in outcome.reports.items():
                     for anchor_id, verdict in zip(frame.anchor_ids.tolist(), report.verdicts, strict=True):
                         result.anchor_verdicts[name][anchor_id][verdict] += 1
+                    if report.iterations is not None:
+                        result.iterations[name].append(report.iterations)
         for name, pose in tick.poses.items():
             if pose is not None:
                 result.poses[name].append(pose)
@@ -233,6 +239,7 @@ def summary(result: Replay) -> dict[str, object]:
             "update_ms": result.update_times[name].mean_ms,
             "verdicts": dict(result.verdicts[name]),
             "anchors": {str(i): dict(counts) for i, counts in sorted(result.anchor_verdicts[name].items())},
+            "solver_iterations": fmean(taken) if (taken := result.iterations[name]) else None,
         }
         for name in result.names
     }

@@ -10,6 +10,7 @@ from companion.alignment import Alignment
 from companion.config import Config
 from companion.estimator_choice import chosen_settings, split_choice
 from companion.evaluate import Errors, Reference, compare
+from companion.legs import LegFigures, leg_figures
 from companion.log import Truth
 from companion.metrics import integrity_violations, relative_errors, trajectory_error
 from companion.pipeline import Chain, Outcome, Pipeline, make_front_end, make_monitor, make_sensors
@@ -72,6 +73,8 @@ class TrialFigures:
         epoch_bound_ratio: `rmse_m` over what a single frame of unblocked ranges allows; below 1 for what has
             a memory or a LiDAR; None when not known.
         errors: at every instant.
+        iterations: mean steps of its solver for a frame; None without such a solver.
+        legs: the same errors on the legs that the scenario names.
     """
 
     rmse_m: float
@@ -98,6 +101,8 @@ class TrialFigures:
     integrity: float | None
     epoch_bound_ratio: float | None
     errors: Errors
+    iterations: float | None
+    legs: dict[str, LegFigures]
 
 
 def run_trial(
@@ -144,9 +149,11 @@ def run_trial(
     covered = sum(reference.covers(stamp_ns) for stamp_ns in instants)
     epoch_bound = _epoch_bound(scenario, setup, np.array([truth.pose for truth in truths]))
     sought_ns = _sought_since(scenario, truths)
-    return {
-        choice: trial_figures(
-            compare(poses[choice], reference, covered),
+    found: dict[str, TrialFigures | None] = {}
+    for choice in choices:
+        errors = compare(poses[choice], reference, covered)
+        found[choice] = trial_figures(
+            errors,
             watched[choice],
             instants[0],
             alignment,
@@ -154,9 +161,9 @@ def run_trial(
             epoch_bound=epoch_bound,
             sought_ns=sought_ns,
             ranges=scores[choice],
+            legs=leg_figures(scenario, errors),
         )
-        for choice in choices
-    }
+    return found
 
 
 def make_choice(config: Config, setup: Setup, choice: str, start: FloatArray) -> Estimator:
@@ -317,6 +324,7 @@ def trial_figures(
     epoch_bound: float | None = None,
     sought_ns: int | None = None,
     ranges: RangeScore | None = None,
+    legs: dict[str, LegFigures] | None = None,
 ) -> TrialFigures | None:
     """Figures of one estimator in one trial; None when it gave no pose where truth is known.
 
@@ -329,6 +337,7 @@ def trial_figures(
         epoch_bound: as `bound`, for estimators of a single frame of ranges [m].
         sought_ns: from when on the pose had to be found; None when it was known.
         ranges: what became of blocked and clean ranges; None when nobody knows which are which.
+        legs: figures of the legs that have names.
     """
     accuracy = errors.accuracy()
     if accuracy is None:
@@ -365,4 +374,6 @@ def trial_figures(
         integrity=integrity_violations(errors, healthy_ns),
         epoch_bound_ratio=accuracy.rmse / epoch_bound if epoch_bound else None,
         errors=errors,
+        iterations=float(np.mean(watched.iterations)) if watched.iterations else None,
+        legs=legs or {},
     )

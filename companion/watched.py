@@ -18,6 +18,7 @@ class WatchedEstimator:
     Attributes:
         seconds: time of each update that it had a use for.
         nis: NIS of every range that it accepted.
+        iterations: steps of its solver for each frame, if it has one.
         healthy_ns: stamps of the poses that a live run would send.
     """
 
@@ -26,6 +27,7 @@ class WatchedEstimator:
         self._monitor = monitor
         self.seconds: list[float] = []
         self.nis: list[float] = []
+        self.iterations: list[int] = []
         self.healthy_ns: list[int] = []
 
     def reset(self) -> None:
@@ -39,6 +41,8 @@ class WatchedEstimator:
         took = time.perf_counter() - begin
         if Verdict.NOT_USED not in report.verdicts:
             self.seconds.append(took)
+        if report.iterations is not None:
+            self.iterations.append(report.iterations)
         self._monitor.observe(measurement, report)
         if isinstance(measurement, RangeFrame) and len(report.nis):
             judged = zip(report.verdicts, report.nis.tolist(), strict=True)

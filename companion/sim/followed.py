@@ -28,6 +28,7 @@ class FollowedTrajectory:
 
     def __init__(self, start: FloatArray) -> None:
         self.start = start
+        self.legs: list[tuple[float, float]] = []
         self._lock = threading.Lock()
         self._poses: deque[tuple[float, FloatArray]] = deque([(0.0, start)], maxlen=KEPT)
 

@@ -96,3 +96,30 @@ def increment(reference: FloatArray, pose: FloatArray) -> tuple[FloatArray, Floa
     by_reference[0, 2] = value[1]
     by_reference[1, 2] = -value[0]
     return value, by_reference, by_pose
+
+
+def constant_acceleration(dt: float, jerk_noise: float) -> tuple[FloatArray, FloatArray]:
+    """Transition and process noise of (x, y, vx, vy, ax, ay).
+
+    Args:
+        dt: time step [s]; negative steps look back, their noise is that of the positive step.
+        jerk_noise: density of the white jerk [m/s^3/sqrt(Hz)].
+
+    Returns:
+        F (6, 6) and Q (6, 6).
+
+    Source: Bar-Shalom et al., Estimation with Applications to Tracking and Navigation, 6.2.3.
+    """
+    F = np.eye(6)
+    F[[0, 1, 2, 3], [2, 3, 4, 5]] = dt
+    F[[0, 1], [4, 5]] = dt * dt / 2.0
+    step, sign = abs(dt), np.sign(dt)
+    by_axis = jerk_noise**2 * np.array(
+        [
+            [step**5 / 20.0, sign * step**4 / 8.0, step**3 / 6.0],
+            [sign * step**4 / 8.0, step**3 / 3.0, sign * step**2 / 2.0],
+            [step**3 / 6.0, sign * step**2 / 2.0, step],
+        ]
+    )
+    Q: FloatArray = np.kron(by_axis, np.eye(2)).astype(np.float64)
+    return F, Q
