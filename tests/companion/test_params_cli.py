@@ -7,12 +7,15 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from unittest.mock import patch
 
 import pytest
 from pymavlink import mavparm
 from pymavlink.dialects.v20 import all as mavlink2
+from rich.console import Console
 from typer.testing import CliRunner
 
+from companion import params_cli
 from companion.cli import app
 from companion.config import params_dir
 from companion.errors import UserError
@@ -66,7 +69,9 @@ def ardupilot(name: str = "uwb_lidar", **other: float) -> ScriptedAutopilot:
 
 
 def run(*arguments: str, text: str = "") -> tuple[int, str]:
-    result = CliRunner().invoke(app, ["params", *arguments], input=text, env={"COLUMNS": "160"})
+    # Wide enough for a table whose texts are not folded.
+    with patch.object(params_cli, "out", Console(highlight=False, width=160)):
+        result = CliRunner().invoke(app, ["params", *arguments], input=text)
     if isinstance(result.exception, UserError):
         raise result.exception
     return result.exit_code, result.output
