@@ -7,12 +7,12 @@ from typing import Annotated
 import numpy as np
 import typer
 from rich import box
-from rich.console import Console
 from rich.table import Table
 
 from companion.calibration.ranges import Calibration
 from companion.config import Config, load_config
 from companion.errors import UserError
+from companion.terminal import message_console, result_console
 
 MAX_SPREAD, MIN_USED_SHARE = 0.2, 0.8
 """An anchor whose used errors scatter more than this [m], or with a smaller share used, was hidden."""
@@ -82,10 +82,10 @@ def ranges(
         if not by_anchor:
             raise UserError(f"{log}: no anchor has enough ranges where the position is known")
         found = fit_biases(by_anchor)
-    out = Console(highlight=False)
+    out = result_console()
     out.print(_range_table(found, config))
     for anchor_id in _badly_seen(found):
-        Console(stderr=True, highlight=False).print(
+        message_console().print(
             f"[yellow]anchor {anchor_id}: its errors scatter too much for noise, something stood before it; "
             "calibrate in line of sight[/]",
             soft_wrap=True,
@@ -119,7 +119,7 @@ def mounting(log: Log_, site: Site, until: Until = None, figures: Json = None) -
         table.add_row(f"body.tag {axis}", *row)
     delay = (f"{found.delay * 1e3:.1f}", f"{found.delay_sigma * 1e3:.1f}", "ms")
     table.add_row("ranges stamped late by", "0.0", *delay)
-    out = Console(highlight=False)
+    out = result_console()
     out.print(table)
     sensor = "UWB" if found.delay >= 0.0 else "LiDAR"
     out.print(

@@ -18,6 +18,7 @@ from companion.frame_check import Finding, judge_autopilot, judge_compass, judge
 from companion.live import LiveRun
 from companion.mavlink.contact import Watch
 from companion.mavlink.pose_out import ned_from_map
+from companion.terminal import message_console, result_console
 from drivers.mavlink_frames import MavlinkMessage
 from estimators.geometry import wrap_angle
 from estimators.messages import FloatArray
@@ -96,7 +97,7 @@ def frames(
 
     Exit codes: 0 all agrees, 1 something does not, 2 the call is wrong or there is no good pose.
     """
-    out, err = Console(highlight=False, soft_wrap=True), Console(stderr=True, highlight=False)
+    out, err = result_console(), message_console()
     assignments = [*(sets or []), *([f"mavlink.url={mavlink}"] if mavlink is not None else [])]
     findings: list[Finding] = []
     with (

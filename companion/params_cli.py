@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
 from companion.autopilot_client import AutopilotClient, Comparison, compare_parameters
 from companion.mavlink.parameter_files import Setting, read_settings, settings_file, write_settings
+from companion.terminal import message_console, result_console
 
 EXIT_DIFFERENT = 1
 
@@ -21,8 +21,7 @@ app = typer.Typer(
     no_args_is_help=True,
     rich_markup_mode="rich",
 )
-out = Console(highlight=False)
-err = Console(stderr=True, highlight=False)
+out, err = result_console(), message_console()
 
 File = Annotated[
     str,

@@ -9,10 +9,10 @@ from typing import Annotated
 
 import numpy as np
 import typer
-from rich.console import Console
 from rich.markup import escape
 
 from companion.config import params_dir
+from companion.terminal import message_console, result_console
 
 EXIT_NOT_FOLLOWED = 1
 
@@ -49,13 +49,13 @@ def sitl(
     from companion.sim.scenario import load_scenario
     from companion.sitl import SitlRun
 
-    out, err = Console(highlight=False, soft_wrap=True), Console(stderr=True, highlight=False)
+    out, err = result_console(), message_console()
     path = Path(world) if Path(world).is_file() else params_dir() / "scenarios" / f"{world}.toml"
     folder = folder or Path("out") / datetime.now().astimezone().strftime("sitl-%Y%m%d-%H%M%S")
     begin = time.monotonic()
 
     def say(line: str) -> None:
-        err.print(f"[dim]{time.monotonic() - begin:8.1f}[/]  {escape(line)}", soft_wrap=True)
+        err.print(f"[dim]{time.monotonic() - begin:8.1f}[/]  {escape(line)}")
 
     say(f"waiting for the autopilot on {connect}")
     run = SitlRun(load_scenario(path, seed, sets or []), connect, folder, say)

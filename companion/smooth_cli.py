@@ -6,13 +6,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import typer
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 from companion.config import load_config
 from companion.errors import UserError
 from companion.log import Log
+from companion.terminal import Sets, message_console, progress, result_console
 
 if TYPE_CHECKING:
     from companion.smooth import SmoothedLog
@@ -31,10 +30,7 @@ def smooth(
     folder: Annotated[
         Path | None, typer.Option("--out", metavar="DIR", help="Folder to write; default out/LOGNAME-smooth.")
     ] = None,
-    sets: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="Change one setting of the site. Repeatable."),
-    ] = None,
+    sets: Sets = None,
 ) -> None:
     """Find the course that fits a whole log best: every pose from what came before it and after.
 
@@ -48,23 +44,13 @@ def smooth(
     from companion.smooth import SMOOTHED, anchors_toml, smooth_log
     from companion.tables import accuracy_table
 
-    out, err = Console(), Console(stderr=True, highlight=False)
+    out, err = result_console(), message_console()
     opened = Log(log)
     config = load_config(site, sets or []) if site else config_of(opened, sets or [])
     folder = folder or Path("out") / f"{log.stem}-smooth"
-    with Progress(
-        TextColumn("{task.description:>9}"),
-        BarColumn(),
-        TaskProgressColumn(),
-        TimeRemainingColumn(),
-        console=err,
-        transient=True,
-        disable=not err.is_terminal,
-    ) as progress:
-        bar = progress.add_task(log.name, total=1.0)
-        found = smooth_log(
-            opened, config, anchors, biases, lambda share: progress.update(bar, completed=share)
-        )
+    with progress(err) as shown:
+        bar = shown.add_task(log.name, total=1.0)
+        found = smooth_log(opened, config, anchors, biases, lambda share: shown.update(bar, completed=share))
     files = {
         "poses.tum": "".join(tum_line(pose) for pose in found.replay.poses[SMOOTHED]),
         "summary.json": json.dumps(_summary(found), indent=2) + "\n",
