@@ -139,7 +139,7 @@ BAD_INPUT = {
     ),
     "unknown scenario": (
         ["emulate", "moon"],
-        "no file moon and none of that name in params/scenarios; there are: hostile_room, huang2024, ",
+        "no file moon and none of that name in params/scenarios; there are: corridor, ",
     ),
     "unwritable log": (["simulate", "square_room", "--out", "text.mcap/log"], "cannot write the log"),
     "unwritable folder": (["demo", "--out", "text.mcap/demo"], "cannot write the log"),
