@@ -27,6 +27,8 @@ EVERY_ESTIMATOR = pytest.mark.parametrize("name", sorted(ESTIMATORS))
 LONG = settings(deadline=None, max_examples=50)
 
 SECOND_NS = 10**9
+LONGEST_NOTE = 35
+"""Characters that a text to the pilot has room for."""
 SMALL_COV = np.diag([1e-4, 1e-4, 1e-5])
 
 
@@ -89,6 +91,7 @@ def assert_report_fits(report: Report, measurement: Measurement) -> None:
     assert len(report.verdicts) == expected
     assert len(report.residuals) in {0, expected}
     assert len(report.nis) in {0, expected}
+    assert len(report.note) <= LONGEST_NOTE
 
 
 def assert_pose_is_sound(pose: PoseEstimate, stamp_ns: int) -> None:

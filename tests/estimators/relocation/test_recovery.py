@@ -75,8 +75,8 @@ def test_while_the_start_is_unknown_there_is_no_pose_but_a_reason() -> None:
     reports = feed(estimator, robot.walk(10.0, speed=0.0))
     assert estimator.pose_at(robot.now_ns) is None
     assert {verdict for report in reports for verdict in report.verdicts} == {Verdict.WAITING}
-    assert reports[0].note == "looking for the pose: waiting for LiDAR increments and ranges"
-    assert reports[-1].note == "looking for the pose: drive a metre"
+    assert reports[0].note == "waiting for increments and ranges"
+    assert reports[-1].note == "drive a metre"
     found = [report.note for report in feed(estimator, robot.walk(5.0))]
     assert found[-1] == ""
     assert is_right(estimator, robot)
@@ -100,7 +100,7 @@ def test_anchors_nearly_in_line_are_no_ground_for_a_guess() -> None:
     robot.pose = np.array([2.0, 3.0, 0.3])
     reports = feed(estimator, robot.walk(6.0, bends=False))
     assert estimator.pose_at(robot.now_ns) is None
-    assert reports[-1].note == "looking for the pose: ranges fit two places, drive a curve"
+    assert reports[-1].note == "two places fit, drive a curve"
 
 
 @pytest.mark.parametrize("name", FILTERS)
@@ -180,7 +180,7 @@ def test_a_heading_that_a_gap_in_the_scans_lost_is_found_again() -> None:
     lost = estimator.pose_at(robot.now_ns)
     assert lost is not None
     assert lost.cov[5, 5] == np.inf
-    assert reports[-1].note.startswith("looking for the pose:")
+    assert reports[-1].note
     feed(estimator, robot.walk(5.0))
     assert is_right(estimator, robot)
     assert reset_counter(estimator, robot) == 1
