@@ -22,7 +22,8 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 from typer.core import TyperGroup
 
 from companion import __version__
-from companion.config import default_toml, load_config, params_dir
+from companion.config import default_toml, load_config
+from companion.config import named_file as _named
 from companion.doctor import app as doctor
 from companion.errors import UserError
 from companion.evaluate_cli import app as evaluate_app
@@ -430,17 +431,6 @@ def main() -> NoReturn:
         err.print("[red]error:[/]", escape(str(error)), soft_wrap=True)
         sys.exit(EXIT_BAD_INPUT)
     sys.exit(0)
-
-
-def _named(path: Path, kind: str) -> Path:
-    """A file of the user's, or one of ours in `params/KIND` by its bare name."""
-    if path.exists() or path.suffix or path.name != str(path):
-        return path
-    ours = params_dir() / kind / f"{path}.toml"
-    if not ours.exists():
-        names = ", ".join(sorted(p.stem for p in ours.parent.glob("*.toml")))
-        raise UserError(f"no file {path} and none of that name in params/{kind}; there are: {names}")
-    return ours
 
 
 def _scenario_path(name: str) -> Path:

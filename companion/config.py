@@ -397,6 +397,21 @@ def params_dir() -> Path:
     return next(p for p in (here / "_params", here.parent / "params") if p.is_dir())
 
 
+def named_file(path: Path, kind: str) -> Path:
+    """A file of the user's, or one of ours in `params/KIND` by its bare name.
+
+    Raises:
+        UserError: there is no such file; names ours.
+    """
+    if path.exists() or path.suffix or path.name != str(path):
+        return path
+    ours = params_dir() / kind / f"{path}.toml"
+    if not ours.exists():
+        names = ", ".join(sorted(p.stem for p in ours.parent.glob("*.toml")))
+        raise UserError(f"no file {path} and none of that name in params/{kind}; there are: {names}")
+    return ours
+
+
 @cache
 def _estimator_tables() -> type[Table]:
     """A table with one key an estimator, each with the estimator's own keys."""

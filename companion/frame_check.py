@@ -70,7 +70,7 @@ def judge_compass(ours: float, autopilots: float) -> Finding:
         autopilots: of its ATTITUDE [rad].
     """
     off = degrees(wrap_angle(autopilots - ours))
-    text = f"compass: autopilot {degrees(autopilots) % 360:.0f} deg, ours {degrees(ours) % 360:.0f} deg"
+    text = f"compass: autopilot {round(degrees(autopilots)) % 360} deg, ours {round(degrees(ours)) % 360} deg"
     if abs(off) <= MAX_COMPASS_DEG:
         return Finding(True, f"{text}: agrees")
     return Finding(False, f"{text}: if the compass is right, add {off:+.0f} deg to site.map_heading_deg")

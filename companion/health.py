@@ -135,6 +135,7 @@ class HealthMonitor:
         self._has_ranges = has_ranges
         self._has_scans = has_scans
         self._used = 6 if needs_heading else 5
+        self._heading_advice = "" if has_scans else "without LiDAR or odometry set mavlink.heading = false"
         self._resets = 0
         self._accepted_share: float
         self._short_share: float
@@ -237,7 +238,7 @@ class HealthMonitor:
             return Health(State.STARTING, f"waiting for a {awaited[0]}")
         cov = pose.cov[: self._used, : self._used]
         if np.isposinf(pose.cov[5, 5]) and self._used == 6:
-            what = self._note or "start again on the start mark"
+            what = self._note or self._heading_advice or "start again on the start mark"
             return Health(State.LOST, f"heading not known: {what}", self._note or "heading not known")
         if not (np.isfinite(pose.T_map_body).all() and np.isfinite(cov).all()):
             return Health(State.LOST, "pose or covariance is not finite")
@@ -250,7 +251,8 @@ class HealthMonitor:
         sigma_yaw = float(np.rad2deg(np.sqrt(pose.cov[5, 5])))
         if self._used == 6 and sigma_yaw > table.max_sigma_yaw_deg:
             what = f"heading sigma {sigma_yaw:.0f} deg"
-            return Health(State.LOST, f"{what} above {table.max_sigma_yaw_deg:g} deg", what)
+            why = f"{what} above {table.max_sigma_yaw_deg:g} deg"
+            return Health(State.LOST, ": ".join(filter(None, (why, self._heading_advice))), what)
         if self._has_ranges and not self._agrees:
             return self._disagreement(now_ns)
         stale = [s for s in sources if s.is_stale]

@@ -1,5 +1,7 @@
 """The frame self-test: what a walk says of the axes."""
 
+import re
+
 import numpy as np
 import pytest
 from hypothesis import assume, given
@@ -61,13 +63,19 @@ def test_a_step_is_no_walk() -> None:
     assert "only 0.30 m" in finding.text
 
 
+def test_north_is_written_in_one_way() -> None:
+    assert "autopilot 0 deg, ours 0 deg" in judge_compass(-0.001, 0.001).text
+
+
 @given(heading=angles, off=st.floats(-170, 170))
 def test_the_compass_tells_what_to_add_to_the_maps_heading(heading: float, off: float) -> None:
     assume(abs(abs(off) - 20.0) > 0.01)
     finding = judge_compass(heading, heading + np.deg2rad(off))
     assert finding.agrees is (abs(off) <= 20.0)
     if not finding.agrees:
-        assert f"add {off:+.0f} deg" in finding.text
+        added = re.search(r"add ([+-]\d+) deg", finding.text)
+        assert added is not None
+        assert int(added[1]) == pytest.approx(off, abs=0.5 + 1e-6)
 
 
 def test_an_autopilot_that_goes_another_way_or_not_at_all() -> None:

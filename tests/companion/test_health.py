@@ -81,7 +81,9 @@ def test_a_heading_that_nobody_needs_may_be_unknown() -> None:
         monitor = HealthMonitor(HealthTable.model_validate({}), True, False, needs_heading=needs_heading)
         for stamp_ns in range(0, 5 * SECOND, SECOND // 10):
             monitor.observe(ranges(stamp_ns), Report((Verdict.ACCEPTED,) * 4))
-        assert monitor.judge(pose(cov), 5 * SECOND).state is expected
+        health = monitor.judge(pose(cov), 5 * SECOND)
+        assert health.state is expected
+        assert health.reason.endswith("set mavlink.heading = false") is needs_heading
 
 
 def test_a_sensor_that_never_speaks_is_degraded_after_a_while() -> None:
