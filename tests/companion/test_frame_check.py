@@ -1,16 +1,28 @@
 """The frame self-test: what a walk says of the axes."""
 
 import re
+import threading
+import time
+from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
+from typer.testing import CliRunner
 
+from companion.cli import app
 from companion.frame_check import judge_autopilot, judge_compass, judge_walk
+from companion.sim.emulate import Emulator
+from companion.sim.scenario import load_scenario
 from estimators.geometry import compose
+from tests.companion.mavlink.scripted_autopilot import ScriptedAutopilot
+from tests.companion.test_sitl import served
+from tests.conftest import write_scenario
 
 angles = st.floats(-3.1, 3.1)
+REST = 5.0
+"""Before the walk [s]: so long it takes until the pose is good."""
 
 
 def walked(
@@ -83,3 +95,41 @@ def test_an_autopilot_that_goes_another_way_or_not_at_all() -> None:
     assert judge_autopilot(north, north * 0.9).agrees
     assert judge_autopilot(north, np.array([0.0, 2.0])).agrees is False
     assert judge_autopilot(north, np.zeros(2)).agrees is None
+
+
+@pytest.mark.realtime
+def test_two_walks_of_an_emulated_robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    legs = "waypoints = [[1.5, 1.2], [2.7, 1.2], [2.7, 2.4]]"
+    walk = f"[trajectory]\n{legs}\nlaps = 0\nrest = {REST}\nspeed = 0.8\n"
+    scenario = load_scenario(write_scenario(tmp_path, walk), 3, [])
+    times = np.arange(0.0, scenario.trajectory.duration, 0.01)
+    yaw = scenario.trajectory.at(times).pose[:, 2]
+    arrivals = [float(times[np.argmax(yaw > yaw[0] + 0.02)]), scenario.trajectory.duration - REST]
+    emulator, stop = Emulator(scenario), threading.Event()
+    devices = threading.Thread(target=emulator.run, args=(stop, lambda _: None))
+
+    def wait_for_the_corner(*_: object, **__: object) -> str:
+        arrival = arrivals.pop(0)
+        while emulator.robot.seconds(time.monotonic_ns()) < arrival:
+            time.sleep(0.01)
+        return ""
+
+    monkeypatch.setattr("companion.frames_cli.typer.prompt", wait_for_the_corner)
+    ports = [f"sensor.{name}.port={port.path}" for name, port in emulator.ports.items()]
+    devices.start()
+    try:
+        with served(ScriptedAutopilot(time.monotonic_ns())) as url:
+            sets = [word for port in ports for word in ("--set", port)]
+            result = CliRunner().invoke(
+                app, ["doctor", "frames", "--site", "demo_room", "--mavlink", url, *sets]
+            )
+    finally:
+        stop.set()
+        devices.join()
+        emulator.close()
+    lines = result.stdout.splitlines()
+    # The autopilot's compass shows north, the site's map 30 deg.
+    assert re.match(r"wrong +compass: autopilot 0 deg, ours (29|30|31) deg.* add -(29|30|31) deg", lines[0])
+    assert re.match(r"ok +forward: \d\.\d\d m, .* agrees", lines[1])
+    assert re.match(r"ok +left: \d\.\d\d m, .* agrees", lines[2])
+    assert result.exit_code == 1
