@@ -122,9 +122,12 @@ def frames(
             )
             end = walker.pose()
             findings.append(judge_walk(what, begin, end))
-            if autopilots_begin is not None and walker.position is not None and walker.is_surveyed:
+            if walker.yaw is not None and walker.is_surveyed:
                 ours = ned_from_map(walker.map_heading)[:2, :2] @ (end - begin)[:2]
-                findings.append(judge_autopilot(ours, walker.position - autopilots_begin))
+                moved = None
+                if autopilots_begin is not None and walker.position is not None:
+                    moved = walker.position - autopilots_begin
+                findings.append(judge_autopilot(ours, moved))
     for finding in findings:
         mark = {True: "[green]ok[/]    ", False: "[red]wrong[/] ", None: "[yellow]open[/]  "}[finding.agrees]
         out.print(f"{mark} {escape(finding.text)}")

@@ -206,6 +206,10 @@ def test_the_velocity_is_that_of_the_pose(name: str) -> None:
     # It has followed the increments, of which each leads 4.5 cm further in a tenth of a second.
     assert np.hypot(*pose.velocity[:2]) == pytest.approx(0.45, rel=0.25)
     assert_is_covariance(pose.velocity_cov)
+    # White acceleration of density 0.5 m/s^2/sqrt(Hz) makes it less certain with time, the height apart.
+    assert later.velocity_cov is not None
+    grown = np.diag([0.25 * 0.01, 0.25 * 0.01, 0.0])
+    np.testing.assert_allclose(later.velocity_cov - pose.velocity_cov, grown, atol=1e-9)
 
 
 @EVERY_ESTIMATOR

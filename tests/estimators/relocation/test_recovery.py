@@ -168,9 +168,10 @@ def test_a_wrong_start_mark_is_found_out_and_put_right(placement: FloatArray) ->
     assert is_right(estimator, robot)
 
 
-def test_a_heading_that_a_gap_in_the_scans_lost_is_found_again() -> None:
+@pytest.mark.parametrize("name", ["ekf", "graph"])
+def test_a_heading_that_a_gap_in_the_scans_lost_is_found_again(name: str) -> None:
     robot = Robot(ROOM, 4)
-    estimator = recovering("ekf", known_start(ROOM, robot.pose))
+    estimator = recovering(name, known_start(ROOM, robot.pose))
     feed(estimator, robot.walk(4.0))
     for measurement in robot.walk(4.0):
         if len(getattr(measurement, "ranges", [])):
@@ -183,7 +184,9 @@ def test_a_heading_that_a_gap_in_the_scans_lost_is_found_again() -> None:
     assert reports[-1].note
     feed(estimator, robot.walk(5.0))
     assert is_right(estimator, robot)
-    assert reset_counter(estimator, robot) == 1
+    counted = reset_counter(estimator, robot)
+    # The graph counts besides what its own pose jumps by.
+    assert counted == 1 or (name == "graph" and counted > 1)
 
 
 def test_one_of_three_anchors_blocked_for_good_leads_to_no_wrong_guess() -> None:
