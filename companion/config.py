@@ -248,6 +248,8 @@ class Config(Table):
                 'raw_ranges give anchors by latitude and longitude: set site.origin, align = "site"'
             )
         has_lidar = any(table.driver == "rplidar" for table in info.data.get("sensor", {}).values())
+        if mavlink.obstacles and not has_lidar:
+            raise ValueError("obstacles come from a LiDAR, and the site has none: set obstacles = false")
         if has_lidar and (mavlink.inputs.odometry or mavlink.inputs.wheels):
             raise ValueError(
                 "increments of a LiDAR and of the autopilot's link cannot be chained: set inputs.odometry "
@@ -430,7 +432,7 @@ def named_file(path: Path, kind: str) -> Path:
     """A file of the user's, or one of ours in `params/KIND` by its bare name.
 
     Raises:
-        UserError: a bare name that neither has.
+        UserError: a bare name that neither has; names ours.
     """
     if path.exists() or path.suffix or path.name != str(path):
         return path

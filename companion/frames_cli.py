@@ -12,7 +12,7 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from companion.config import load_config
+from companion.config import load_config, named_file
 from companion.errors import UserError
 from companion.frame_check import Finding, judge_autopilot, judge_compass, judge_walk
 from companion.live import LiveRun
@@ -33,7 +33,7 @@ class _Walker:
     """A live run in a thread, and the autopilot's view beside it."""
 
     def __init__(self, site: Path, sets: list[str], folder: Path, console: Console) -> None:
-        self._config = load_config(site, sets)
+        self._config = load_config(named_file(site, "sites"), sets)
         self._console = console
         self.yaw: float | None = None
         self.position: FloatArray | None = None
@@ -48,6 +48,11 @@ class _Walker:
     def __exit__(self, *_: object) -> None:
         self._stop.set()
         self._thread.join()
+
+    @property
+    def is_surveyed(self) -> bool:
+        """Whether the map's heading is the site's; the compass tells nothing of one that came from it."""
+        return self._config.mavlink.align == "site"
 
     @property
     def map_heading(self) -> float:
@@ -107,7 +112,7 @@ def frames(
         err.print("Put the robot on its start mark and keep it still.")
         for what in ("forward", "left"):
             begin, autopilots_begin = walker.pose(), walker.position
-            if what == "forward" and walker.yaw is not None:
+            if what == "forward" and walker.yaw is not None and walker.is_surveyed:
                 findings.append(judge_compass(wrap_angle(walker.map_heading - begin[2]), walker.yaw))
             direction = "straight ahead" if what == "forward" else "to the left of where it looks now"
             typer.prompt(
@@ -118,12 +123,16 @@ def frames(
             )
             end = walker.pose()
             findings.append(judge_walk(what, begin, end))
-            if autopilots_begin is not None and walker.position is not None:
+            if walker.yaw is not None and walker.is_surveyed:
                 ours = ned_from_map(walker.map_heading)[:2, :2] @ (end - begin)[:2]
-                findings.append(judge_autopilot(ours, walker.position - autopilots_begin))
+                moved = None
+                if autopilots_begin is not None and walker.position is not None:
+                    moved = walker.position - autopilots_begin
+                findings.append(judge_autopilot(ours, moved))
     for finding in findings:
         mark = {True: "[green]ok[/]    ", False: "[red]wrong[/] ", None: "[yellow]open[/]  "}[finding.agrees]
         out.print(f"{mark} {escape(finding.text)}")
     if not all(finding.agrees is not False for finding in findings):
         raise typer.Exit(EXIT_DISAGREES)
-    out.print(f"map heading {degrees(walker.map_heading) % 360.0:.1f} deg")
+    if walker.is_surveyed:
+        out.print(f"map heading {degrees(walker.map_heading) % 360.0:.1f} deg")

@@ -11,7 +11,7 @@ import numpy as np
 import typer
 from rich.markup import escape
 
-from companion.config import params_dir
+from companion.config import named_file
 from companion.terminal import message_console, result_console
 
 EXIT_NOT_FOLLOWED = 1
@@ -50,7 +50,7 @@ def sitl(
     from companion.sitl import SitlRun
 
     out, err = result_console(), message_console()
-    path = Path(world) if Path(world).is_file() else params_dir() / "scenarios" / f"{world}.toml"
+    path = named_file(Path(world), "scenarios")
     folder = folder or Path("out") / datetime.now().astimezone().strftime("sitl-%Y%m%d-%H%M%S")
     begin = time.monotonic()
 

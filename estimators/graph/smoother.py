@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import Field
 
 from estimators.base import Report, Setup, Verdict
-from estimators.geometry import lift, wrap_angle
+from estimators.geometry import wrap_angle
 from estimators.graph import factors
 from estimators.graph.errors import GraphError
 from estimators.graph.jumps import is_jump
@@ -90,12 +90,7 @@ class GraphSmoother(KeyframeTracker):
         if self._stamp_ns is None:
             return None
         mean, cov = self._predicted(stamp_ns)
-        cov = cov[POSE, POSE].copy()
-        if not self._heading_known:
-            cov[2, :2] = cov[:2, 2] = 0.0
-            cov[2, 2] = np.inf
-        T_map_body = lift(mean[POSE], self._setup.height)
-        return PoseEstimate(stamp_ns, T_map_body, self._setup.lift_covariance(cov), self._reset_counter)
+        return self._estimate(stamp_ns, mean[STATE], cov[STATE, STATE], self._heading_known)
 
     def _place(self, pose: FloatArray, cov: FloatArray) -> None:
         self._gate.reset()
