@@ -26,6 +26,7 @@ from drivers.errors import PortError
 from drivers.port import parse_address
 from estimators import ESTIMATORS, estimator_config_class
 from estimators.base import Setup, Start
+from estimators.lidar.loop_closure import LoopCloser
 from estimators.lidar.scan_matching import ScanMatcher
 from estimators.lidar.scan_preparation import ScanPreparation
 from estimators.messages import FloatArray
@@ -203,6 +204,7 @@ class Config(Table):
     pipeline: PipelineTable = Field(default_factory=PipelineTable)
     scan_preparation: ScanPreparation.Config = Field(default_factory=ScanPreparation.Config)
     scan_matcher: ScanMatcher.Config = Field(default_factory=ScanMatcher.Config)
+    loop_closure: LoopCloser.Config = Field(default_factory=LoopCloser.Config)
     estimator: Any = Field(
         default_factory=dict, validate_default=True, description="a table for each estimator, by name"
     )

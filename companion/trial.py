@@ -10,6 +10,7 @@ import numpy as np
 from companion.estimator_choice import chosen_settings, split_choice
 from companion.evaluate import Errors, Reference, compare
 from companion.log import Truth
+from companion.look_back import make_look_back
 from companion.pipeline import Chain, Outcome, Pipeline, make_front_end
 from companion.range_score import RangeScore, TrueExcess
 from companion.sim.measurements import MeasuredWalk, measure, setup_of
@@ -170,7 +171,10 @@ def _run_chain(
 ) -> tuple[list[Truth], list[int], list[Outcome]]:
     """The whole chain from emulated bytes on, in memory; poses at its ticks."""
     config = scenario.config
-    chain = Chain(config, START_NS, Pipeline(make_front_end(config), estimators), next(iter(estimators)))
+    front_end = make_front_end(config)
+    names = (split_choice(choice)[0] for choice in estimators if choice not in (LIDAR_ALONE, UWB_ALONE))
+    look_back = make_look_back(config, front_end, names)
+    chain = Chain(config, START_NS, Pipeline(front_end, estimators, look_back), next(iter(estimators)))
     truths: list[Truth] = []
     instants: list[int] = []
     outcomes: list[Outcome] = []

@@ -19,6 +19,7 @@ from estimators.lidar.odometry import MAX_HEADING_SIGMA
 from estimators.messages import (
     FloatArray,
     LandmarkFrame,
+    LoopClosure,
     Measurement,
     PoseEstimate,
     PoseIncrement,
@@ -47,6 +48,9 @@ class GraphSmoother(KeyframeTracker):
         """Settings of `graph`."""
 
         lag: float = Field(3.0, gt=0, le=60, description="the window reaches back so far [s]")
+        places: int = Field(
+            20, ge=0, le=200, description="poses of so many places, the newest, stay in it for loop closures"
+        )
 
     def __init__(self, config: Config, setup: Setup) -> None:
         # Numba loads slowly: only who makes a smoother waits for it.
@@ -55,6 +59,7 @@ class GraphSmoother(KeyframeTracker):
         super().__init__(config, setup)
         self._fixed_lag, self._judging = fixed_lag, judging
         self._lag_ns = round(config.lag * 1e9)
+        self._most_places = config.places
         self._gate = RangeGate(config, setup)
         self._landmark_gate = LandmarkGate(config, setup)
         self._anchor_numbers = {anchor_id: i for i, anchor_id in enumerate(setup.anchors)}
@@ -78,6 +83,8 @@ class GraphSmoother(KeyframeTracker):
             if not isinstance(measurement, PoseIncrement):
                 self._predict_to(measurement.stamp_ns)
                 return self._judge(measurement, *self._predicted(measurement.stamp_ns))
+        if isinstance(measurement, LoopClosure):
+            return self._update_closure(measurement)
         report = super().update(measurement)
         self._gate.see(measurement, self.pose_at)
         return report
@@ -109,6 +116,7 @@ class GraphSmoother(KeyframeTracker):
         stamp_ns = self._stamp_ns
         self._begin_window(0 if stamp_ns is None else stamp_ns)
         self._keyframes: dict[int, int] = {} if stamp_ns is None else {stamp_ns: stamp_ns}
+        self._places: dict[int, int] = {}
 
     def _set_speed_free(self) -> None:
         """Its speed always is; while it stands, nothing is predicted with it."""
@@ -126,13 +134,11 @@ class GraphSmoother(KeyframeTracker):
         if self._stands:
             self._window.stamps_ns[-1] = stamp_ns
             self._keyframes = dict.fromkeys(self._keyframes, stamp_ns)
+            self._places = dict.fromkeys(self._places, stamp_ns)
 
     def _follow(self, measured: PoseIncrement) -> Report:
         mean, cov = self._predicted(measured.stamp_ns)
-        predicted, by_reference, by_pose = increment(mean[REFERENCE], mean[POSE])
-        H = np.zeros((3, 9))
-        H[:, POSE], H[:, REFERENCE] = by_pose, by_reference
-        nis = _increment_nis(measured, predicted, H @ cov @ H.T)
+        nis = _motion_nis(measured, mean[REFERENCE], mean[POSE], cov)
         passes = nis <= self._increment_gate and self._take_increment(measured)
         return Report((Verdict.ACCEPTED if passes else Verdict.GATED,), np.full(1, np.nan), np.array([nis]))
 
@@ -198,6 +204,35 @@ class GraphSmoother(KeyframeTracker):
             self._keep_keyframe(measured.stamp_ns)
         return verdict
 
+    def _update_closure(self, measured: LoopClosure) -> Report:
+        """Take a closure at the newest keyframe, if its place is still in the window.
+
+        The place stayed there as a node, so what its pose and that of now have in common is known, and
+        nothing is counted twice.
+        """
+        node_ns = self._keyframes.get(measured.stamp_ns)
+        if node_ns is None or node_ns != self._window.stamps_ns[-1]:
+            return Report((Verdict.NO_REFERENCE,))
+        if measured.from_stamp_ns == measured.stamp_ns:
+            self._places[measured.stamp_ns] = node_ns
+            while len(self._places) > self._most_places:
+                del self._places[next(iter(self._places))]
+            return Report((Verdict.ACCEPTED,))
+        if not (np.isfinite(measured.increment).all() and is_covariance(measured.cov)):
+            return Report((Verdict.IMPOSSIBLE,))
+        place = self._window.node_at(self._places.get(measured.from_stamp_ns, -1))
+        if place is None or place == len(self._window.stamps_ns) - 1:
+            return Report((Verdict.NO_REFERENCE,))
+        try:
+            cov = self._window.update(place)
+        except GraphError:
+            return Report((Verdict.GATED,))
+        variable = self._window.variable(place)
+        nis = _motion_nis(measured, self._window.graph.values[variable], self._window.newest[0], cov)
+        rows = factors.increments(variable, -1, measured.increment, measured.cov)
+        passes = nis <= self._increment_gate and self._take(measured.stamp_ns, "increments", rows)
+        return Report((Verdict.ACCEPTED if passes else Verdict.GATED,), np.full(1, np.nan), np.array([nis]))
+
     def _take_increment(self, measured: PoseIncrement) -> bool:
         node = self._node_of(measured.stamp_ns)
         reference = self._node_of_keyframe(measured.from_stamp_ns)
@@ -224,7 +259,7 @@ class GraphSmoother(KeyframeTracker):
             cov = window.update(reference)
         except GraphError:
             self._begin_window(int(window.stamps_ns[-1]))
-            self._keyframes = {}
+            self._keyframes, self._places = {}, {}
             self._reference_stamp_ns = None
             return False
         mean = window.newest.ravel()
@@ -238,10 +273,12 @@ class GraphSmoother(KeyframeTracker):
         if self._stands:
             window.absorb()
             return True
-        kept = () if self._reference_stamp_ns is None else (self._keyframes.get(self._reference_stamp_ns, 0),)
+        kept = [*self._places.values()]
+        if self._reference_stamp_ns is not None:
+            kept.append(self._keyframes.get(self._reference_stamp_ns, 0))
         window.drop_before(int(window.stamps_ns[-1]) - self._lag_ns, kept)
-        oldest_ns = window.stamps_ns[0]
-        self._keyframes = {k: node_ns for k, node_ns in self._keyframes.items() if node_ns >= oldest_ns}
+        nodes_ns = set(window.stamps_ns.tolist())
+        self._keyframes = {k: node_ns for k, node_ns in self._keyframes.items() if node_ns in nodes_ns}
         return True
 
     def _begin_window(self, stamp_ns: int) -> None:
@@ -292,7 +329,17 @@ class GraphSmoother(KeyframeTracker):
         return None if node_ns is None else self._window.node_at(node_ns)
 
 
-def _increment_nis(measured: PoseIncrement, predicted: FloatArray, spread: FloatArray) -> float:
+def _motion_nis(
+    measured: PoseIncrement | LoopClosure, reference: FloatArray, pose: FloatArray, cov: FloatArray
+) -> float:
+    """Normalised innovation squared of a motion, from the covariance (9, 9) of pose, velocity and reference."""
+    predicted, by_reference, by_pose = increment(reference, pose)
+    H = np.zeros((3, 9))
+    H[:, POSE], H[:, REFERENCE] = by_pose, by_reference
+    return _increment_nis(measured, predicted, H @ cov @ H.T)
+
+
+def _increment_nis(measured: PoseIncrement | LoopClosure, predicted: FloatArray, spread: FloatArray) -> float:
     """Normalised innovation squared of an increment, whose prediction has a covariance (3, 3)."""
     residual = measured.increment - predicted
     residual[2] = wrap_angle(residual[2])

@@ -116,11 +116,12 @@ class ScanMatcher:
         self._T_body_lidar = T_body_lidar
         self._preparation = ScanPreparation(preparation or ScanPreparation.Config(), T_body_lidar)
         self._keyframe: LineMap | None = None
-        self._keyframe_ns = 0
         self._keyframe_is_blind = False
         self._stamp_ns = 0
         self._state = np.zeros(6)
         self._cov = np.zeros((6, 6))
+        self.keyframe_ns = 0
+        """Time of the newest keyframe."""
         self.points = np.empty((0, 2))
         """(N, 2) [m] of the newest scan, as seen from where the body is at its end."""
         self.points_cov = np.zeros((3, 3))
@@ -156,7 +157,7 @@ class ScanMatcher:
         # A keyframe that was taken without knowing the speed is distorted, so it is left at once.
         is_keyframe = self._keyframe_is_blind or self._moved_far() or match.share < KEYFRAME_SHARE
         cov = match.increment_cov + self.points_cov
-        increment = PoseIncrement(self._keyframe_ns, stamp_ns, match.increment, cov, is_keyframe)
+        increment = PoseIncrement(self.keyframe_ns, stamp_ns, match.increment, cov, is_keyframe)
         if is_keyframe:
             self._found_keyframe(is_blind=False)
         return increment
@@ -179,7 +180,7 @@ class ScanMatcher:
         """
         config = self._config
         self._keyframe = self._line_map.LineMap(self.points, config.range_sigma, config.max_correspondence)
-        self._keyframe_ns, self._keyframe_is_blind = self._stamp_ns, is_blind
+        self.keyframe_ns, self._keyframe_is_blind = self._stamp_ns, is_blind
         turn = np.eye(6)
         turn[:2, :2] = turn[3:5, 3:5] = rotation(-self._state[2])
         self._state = turn @ self._state
