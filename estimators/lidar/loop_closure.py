@@ -23,13 +23,18 @@ SAME = (0.1, np.deg2rad(3.0))
 TURNED = 0.5
 """A view that is turned by 1 rad is another one as if from so far away [m/rad]."""
 ITERATIONS = 12
+STARTING_POINTS = 150
+"""With about so many points the places that fit are looked for."""
+ALL_POINTS = slice(None)
 LEAST_POINTS = 12
 """On surfaces, with fewer of which nothing is compared."""
 _STILL = np.array([[0.0, 0.0, 1.0, 0.0]])
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(slots=True, eq=False)
 class _Keyframe:
+    """A keyframe as it is compared; `number` is that of the newest one at which it was taken or found again."""
+
     number: int
     stamp_ns: int
     pose: FloatArray
@@ -115,8 +120,11 @@ class LoopCloser:
             return None
         newest = self._keyframe(stamp_ns, pose, points, points_cov)
         if old:
-            closure = self._closure(min(old, key=lambda place: _unlikeness(place.pose, pose)), newest)
+            nearest = min(old, key=lambda place: _unlikeness(place.pose, pose))
+            closure = self._closure(nearest, newest)
             if closure is not None:
+                # The place's own noise is in every closure: a second one of the same passage says little more.
+                nearest.number = self._number
                 return closure
         if is_new and len(newest.surface.points) >= LEAST_POINTS:
             self._places.append(newest)
@@ -150,21 +158,27 @@ class LoopCloser:
     def _only_fit(self, old: _Keyframe, newest: _Keyframe) -> _Fit | None:
         """Best fit round the expected pose; None when there is none, or another that is as good."""
         expected = between(old.pose, newest.pose)
-        fits = [self._fit(old, newest, expected + np.array(start)) for start in STARTS]
+        few = slice(None, None, -(-len(newest.surface.points) // STARTING_POINTS) or 1)
+        places: list[FloatArray] = []
+        for start in STARTS:
+            fit = self._fit(old, newest, expected + np.array(start), few)
+            if fit is not None and not any(_is_same(place, fit.pose) for place in places):
+                places.append(fit.pose)
+        fits = [self._fit(old, newest, place) for place in places]
         good = [fit for fit in fits if fit is not None and fit.share >= self._config.least_share]
         if not good:
             return None
         best = max(good, key=lambda fit: fit.share)
-        for fit in good:
-            apart = between(best.pose, fit.pose)
-            if np.hypot(apart[0], apart[1]) > SAME[0] or abs(apart[2]) > SAME[1]:
-                return None
-        return best
+        return best if all(_is_same(best.pose, fit.pose) for fit in good) else None
 
-    def _fit(self, old: _Keyframe, newest: _Keyframe, guess: FloatArray) -> _Fit | None:
-        """Point-to-line Gauss-Newton of a still scan."""
+    def _fit(
+        self, old: _Keyframe, newest: _Keyframe, guess: FloatArray, which: slice = ALL_POINTS
+    ) -> _Fit | None:
+        """Point-to-line Gauss-Newton of a still scan, or of some of its points."""
         sigma = self._config.range_sigma
-        points, normals = newest.surface.points, newest.surface.normals
+        points, normals = (
+            np.ascontiguousarray(column[which]) for column in (newest.surface.points, newest.surface.normals)
+        )
         if len(points) < LEAST_POINTS:
             return None
         basis = np.repeat(_STILL, len(points), axis=0)
@@ -190,6 +204,11 @@ class LoopCloser:
         pose[2] = wrap_angle(pose[2])
         share = float(np.count_nonzero(distances < 3.0 * scale)) / len(points)
         return _Fit(pose, 0.5 * (cov + cov.T), share)
+
+
+def _is_same(a: FloatArray, b: FloatArray) -> bool:
+    apart = between(a, b)
+    return bool(np.hypot(apart[0], apart[1]) <= SAME[0] and abs(apart[2]) <= SAME[1])
 
 
 def _distance(a: FloatArray, b: FloatArray) -> float:
