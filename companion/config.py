@@ -229,12 +229,6 @@ class Config(Table):
             raise ValueError(
                 'raw_ranges give anchors by latitude and longitude: set site.origin, align = "site"'
             )
-        has_lidar = any(table.driver == "rplidar" for table in info.data.get("sensor", {}).values())
-        if has_lidar and (mavlink.inputs.odometry or mavlink.inputs.wheels):
-            raise ValueError(
-                "increments of a LiDAR and of the autopilot's link cannot be chained: set inputs.odometry "
-                "and inputs.wheels to 0, or leave the LiDAR out of the site"
-            )
         return mavlink
 
     @field_validator("estimator")

@@ -22,6 +22,7 @@ from drivers.autopilot import Autopilot
 from drivers.framing import Sensor
 from estimators import make_estimator
 from estimators.base import Estimator, Report
+from estimators.lidar.fused_odometry import FusedOdometry
 from estimators.lidar.scan_matching import ScanMatcher
 from estimators.messages import LoopClosure, Measurement, PoseEstimate, PoseIncrement, RangeFrame, Scan
 
@@ -88,7 +89,8 @@ class Pipeline:
 
     def step(self, measurement: Measurement) -> list[Outcome]:
         """Process one measurement; a scan also yields the outcomes of its increment and of a loop closure."""
-        outcomes = [self._update(measurement)]
+        # Odometry from outside reaches the estimators by the front end alone, so that it counts once.
+        outcomes = [] if isinstance(measurement, PoseIncrement) else [self._update(measurement)]
         increment = self._front_end.update(measurement)
         if increment is not None:
             outcomes.append(self._update(increment))
@@ -203,14 +205,21 @@ def make_parts(
         close_loops: look for closures although none of the estimators has a use for them.
     """
     setup = config.setup()
-    front_end = make_front_end(config)
+    matcher = make_matcher(config)
     estimators = {
         name: make_estimator(name, config.estimator_config(name), setup, config.relocation) for name in names
     }
-    return front_end, estimators, make_look_back(config, front_end, names, close_loops)
+    look_back = make_look_back(config, matcher, names, close_loops)
+    return make_front_end(config, matcher), estimators, look_back
 
 
-def make_front_end(config: Config) -> ScanMatcher:
+def make_front_end(config: Config, matcher: ScanMatcher) -> FrontEnd:
+    """What turns scans, and odometry from outside, into increments."""
+    inputs = config.mavlink.inputs
+    return FusedOdometry(matcher) if inputs.odometry or inputs.wheels else matcher
+
+
+def make_matcher(config: Config) -> ScanMatcher:
     """What turns the site's scans into increments."""
     return ScanMatcher(config.scan_matcher, config.lidar_mounting(), config.scan_preparation)
 

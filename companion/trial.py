@@ -11,7 +11,7 @@ from companion.estimator_choice import chosen_settings, split_choice
 from companion.evaluate import Errors, Reference, compare
 from companion.log import Truth
 from companion.look_back import make_look_back
-from companion.pipeline import Chain, Outcome, Pipeline, make_front_end
+from companion.pipeline import Chain, Outcome, Pipeline, make_front_end, make_matcher
 from companion.range_score import RangeScore, TrueExcess
 from companion.sim.measurements import MeasuredWalk, measure, setup_of
 from companion.sim.scenario import Scenario, load_scenario
@@ -171,10 +171,10 @@ def _run_chain(
 ) -> tuple[list[Truth], list[int], list[Outcome]]:
     """The whole chain from emulated bytes on, in memory; poses at its ticks."""
     config = scenario.config
-    front_end = make_front_end(config)
+    matcher = make_matcher(config)
     names = (split_choice(choice)[0] for choice in estimators if choice not in (LIDAR_ALONE, UWB_ALONE))
-    look_back = make_look_back(config, front_end, names)
-    chain = Chain(config, START_NS, Pipeline(front_end, estimators, look_back), next(iter(estimators)))
+    pipeline = Pipeline(make_front_end(config, matcher), estimators, make_look_back(config, matcher, names))
+    chain = Chain(config, START_NS, pipeline, next(iter(estimators)))
     truths: list[Truth] = []
     instants: list[int] = []
     outcomes: list[Outcome] = []

@@ -85,7 +85,9 @@ class Recording:
         closures = [m for m in measurements if isinstance(m, LoopClosure) and _is_step(m)]
         frames = [m for m in measurements if isinstance(m, RangeFrame)]
         looks = [m for m in measurements if isinstance(m, LandmarkFrame)]
-        instants = [stamp_ns for m in [*steps, *closures] for stamp_ns in (m.from_stamp_ns, m.stamp_ns)]
+        ends = [(m.from_stamp_ns, m.stamp_ns) for m in steps]
+        ends += [(m.from_stamp_ns, m.stamp_ns) for m in closures]
+        instants = [stamp_ns for pair in ends for stamp_ns in pair]
         instants += [m.stamp_ns for m in frames] + [m.stamp_ns for m in looks]
         self.stamps_ns = _apart(np.unique(np.array(instants, dtype=np.int64)))
         if len(self.stamps_ns) < 2:

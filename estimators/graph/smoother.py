@@ -332,7 +332,7 @@ class GraphSmoother(KeyframeTracker):
 def _motion_nis(
     measured: PoseIncrement | LoopClosure, reference: FloatArray, pose: FloatArray, cov: FloatArray
 ) -> float:
-    """Normalised innovation squared of a motion, from the covariance (9, 9) of pose, velocity and reference."""
+    """Normalised innovation squared of a motion; the covariance (9, 9) is of pose, velocity, reference."""
     predicted, by_reference, by_pose = increment(reference, pose)
     H = np.zeros((3, 9))
     H[:, POSE], H[:, REFERENCE] = by_pose, by_reference

@@ -33,7 +33,7 @@ _STILL = np.array([[0.0, 0.0, 1.0, 0.0]])
 
 @dataclass(slots=True, eq=False)
 class _Keyframe:
-    """A keyframe as it is compared; `number` is that of the newest one at which it was taken or found again."""
+    """A keyframe as it is compared; its number is that of the newest one that was there."""
 
     number: int
     stamp_ns: int
@@ -66,7 +66,10 @@ class LoopCloser:
         model_config = ConfigDict(extra="forbid", frozen=True)
 
         spacing: float = Field(
-            1.0, gt=0, le=50, description="a keyframe this far from every known place founds one, as one that is turned by 2 rad does [m]"
+            1.0,
+            gt=0,
+            le=50,
+            description="a keyframe this far from every known place founds one [m]; 1 rad counts as 0.5 m",
         )
         radius: float = Field(1.5, gt=0, le=50, description="places further away are not compared [m]")
         keyframes_between: int = Field(
@@ -123,7 +126,7 @@ class LoopCloser:
             nearest = min(old, key=lambda place: _unlikeness(place.pose, pose))
             closure = self._closure(nearest, newest)
             if closure is not None:
-                # The place's own noise is in every closure: a second one of the same passage says little more.
+                # Its noise is in every closure: a second one of the same passage says little more.
                 nearest.number = self._number
                 return closure
         if is_new and len(newest.surface.points) >= LEAST_POINTS:
@@ -216,5 +219,5 @@ def _distance(a: FloatArray, b: FloatArray) -> float:
 
 
 def _unlikeness(a: FloatArray, b: FloatArray) -> float:
-    """How far apart views are [m]: a scanner that does not see all round sees other things when it is turned."""
+    """How far apart views are [m]: who does not see all round sees other things when turned."""
     return _distance(a, b) + TURNED * abs(wrap_angle(float(a[2] - b[2])))
