@@ -16,6 +16,8 @@ from estimators.models.motion import cubic_between, smooth_motion
 
 _LEAST_VARIANCE = 1e-8
 """Of what odometry says [m^2, rad^2]."""
+_MODES = np.pi * np.arange(1, 7)
+"""Of a Brownian bridge, that are looked at; what is left out has a seventh of its variance."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -30,6 +32,7 @@ class Expectation:
         F: (6, 6) transition from there to the end of this scan.
         Q: (6, 6) its noise.
         twist: (3,) known velocity at the end, body frame; the states' comes on top of it.
+        drift: (3, 3) covariance of what the known motion errs by from end to end.
     """
 
     points: FloatArray
@@ -39,6 +42,28 @@ class Expectation:
     F: FloatArray
     Q: FloatArray
     twist: FloatArray
+    drift: FloatArray
+
+    def bent(self, shares: FloatArray, by_pose: FloatArray) -> FloatArray:
+        """Covariance (3, 3) that the pose at the end has because the known motion's own errors bend the scan.
+
+        The drift is a random walk and is taken for straight; from there it deviates as a Brownian bridge,
+        whose modes are sines. Each of them moves the beams, and by them the pose that fits best.
+
+        Args:
+            shares: (M,) of the way in time from the scan before, of the beams that are matched.
+            by_pose: (M, 3) change of each beam's distance from its line with the pose at its instant.
+        """
+        if not self.drift.any():
+            return self.drift
+        by_end = shares[:, None] * by_pose
+        hessian = by_end.T @ by_end + _LEAST_VARIANCE * np.eye(3)
+        cov = np.zeros((3, 3))
+        for mode in _MODES:
+            pull = by_end.T @ ((np.sqrt(2.0) / mode * np.sin(mode * shares))[:, None] * by_pose)
+            gain = np.linalg.solve(hessian, pull)
+            cov += gain @ self.drift @ gain.T
+        return cov
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,10 +120,19 @@ def expect(
         beams[:, 2] = gyro.turns(scan.stamp_ns, scan.times)
         twist = np.array([0.0, 0.0, gyro.rate()])
         return Expectation(
-            transform_each(beams, scan.points), cubic_between(shares, dt), state, cov, F, Q, twist
+            transform_each(beams, scan.points),
+            cubic_between(shares, dt),
+            state,
+            cov,
+            F,
+            Q,
+            twist,
+            np.zeros((3, 3)),
         )
     F, Q = smooth_motion(dt, noise.accel, noise.yaw_accel, noise.bandwidth)
-    return Expectation(scan.points, cubic_between(shares, dt), state, cov, F, Q, np.zeros(3))
+    return Expectation(
+        scan.points, cubic_between(shares, dt), state, cov, F, Q, np.zeros(3), np.zeros((3, 3))
+    )
 
 
 def _along_odometry(
@@ -135,4 +169,5 @@ def _along_odometry(
         F,
         Q,
         odometry.twist(),
+        drift,
     )

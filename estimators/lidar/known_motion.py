@@ -38,12 +38,14 @@ class OdometryTrack:
         return self._poses[-1][0] if self._poses else None
 
     def add(self, measured: PoseIncrement) -> None:
-        """Take an increment; one that does not hang on to the newest begins anew, a bad one ends all."""
-        if measured.from_stamp_ns != self.newest_ns or not _is_step(measured):
+        """Take an increment; one that does not hang on to the newest begins anew, and so does a bad one."""
+        is_step = _is_step(measured)
+        if not is_step or measured.from_stamp_ns != self.newest_ns:
             self._poses.clear()
             self._steps.clear()
-            self._poses.append((measured.stamp_ns, np.zeros(3)))
-            return
+            self._poses.append((measured.from_stamp_ns if is_step else measured.stamp_ns, np.zeros(3)))
+            if not is_step:
+                return
         pose = self._poses[-1][1]
         yaw = pose[2] + measured.increment[2]
         pose = compose(pose, measured.increment)

@@ -202,7 +202,7 @@ class ScanMatcher:
         else:
             self.points = transform_each(self.odometry.beams(scan.stamp_ns, scan.times), scan.points)
             self._state[3:] = self.odometry.twist()
-            self._cov[:3, :3], self._cov[3:, 3:] = known[1] / 4.0, known[1] / max(duration, 1e-3) ** 2
+            self._cov[:3, :3], self._cov[3:, 3:] = known[1] / 3.0, known[1] / max(duration, 1e-3) ** 2
         self._cov += _LEAST_VARIANCE * np.eye(6)
         self._found_keyframe(is_blind=known is None)
         return PoseIncrement(scan.stamp_ns, scan.stamp_ns, np.zeros(3), np.zeros((3, 3)), is_keyframe=True)
@@ -258,11 +258,15 @@ class ScanMatcher:
         in_keyframe = transform_each(expected.basis @ states.reshape(4, 3), expected.points)
         self.points = transform(inverse(states[NEWEST]), in_keyframe)
         increment, cov = said_by_scan(prior, predicted, fit)
+        rows, index = keyframe.match(found.points, found.normals, basis, states)
+        bent = expected.bent(1.0 + scan.times[found.own][index >= 0] / dt, rows[index >= 0, 1:4])
         states[9:11] += rotation(states[8]) @ expected.twist[:2]
         states[11] += expected.twist[2]
         velocity = states[9:]
         cov += (1e-3 * config.stamp_sigma_ms) ** 2 * np.outer(velocity, velocity)
+        cov += bent
         cov_of_state = np.linalg.inv(fit.information)[6:, 6:]
+        cov_of_state[:3, :3] += bent
         return _Match(
             states, 0.5 * (cov_of_state + cov_of_state.T), increment, 0.5 * (cov + cov.T), fit.share
         )
