@@ -115,8 +115,7 @@ def test_false_closures_are_refused_online_and_in_the_whole_graph() -> None:
     assert refused == wrong[1::3]
     noise = Noise(range_sigma=0.1, accel=0.5, yaw_accel=0.5)
     whole = smooth(Recording(measured, ON_THE_MARK, noise, {}), lambda _: truth)
-    # Of the seven true ones the search may lose one.
-    assert len(wrong[1::3]) <= whole.false_closures <= len(wrong[1::3]) + 1
+    assert whole.false_closures == len(wrong[1::3])
     assert np.hypot(*(whole.poses[-1] - truth[-1])[:2]) < 0.1
 
 
