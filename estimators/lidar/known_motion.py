@@ -17,6 +17,8 @@ KEPT_NS = 5_000_000_000
 """Motion that is longer ago is forgotten."""
 LONGEST_GUESS_NS = 250_000_000
 """The newest speed is taken to last so long at most."""
+LONGEST_GYRO_GAP_NS = 50_000_000
+"""So long a turn is known between two yaw rates, and after the newest: a robot that swings does so fast."""
 
 
 class OdometryTrack:
@@ -132,7 +134,7 @@ class GyroTrack:
         turned = 0.0
         if self._turned:
             before_ns, before, before_rate = self._turned[-1]
-            if stamp_ns - before_ns > LONGEST_GUESS_NS:
+            if stamp_ns - before_ns > LONGEST_GYRO_GAP_NS:
                 self._turned.clear()
             else:
                 turned = before + 0.5 * (before_rate + rate) * (stamp_ns - before_ns) * 1e-9
@@ -143,7 +145,7 @@ class GyroTrack:
     def covers(self, from_ns: int, to_ns: int) -> bool:
         """Whether the turn between two instants is known."""
         return bool(self._turned) and (
-            self._turned[0][0] <= from_ns <= to_ns <= self._turned[-1][0] + LONGEST_GUESS_NS
+            self._turned[0][0] <= from_ns <= to_ns <= self._turned[-1][0] + LONGEST_GYRO_GAP_NS
         )
 
     def turns(self, stamp_ns: int, times: FloatArray) -> FloatArray:
