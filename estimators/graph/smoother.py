@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import Field
 
 from estimators.base import Report, Setup, Verdict
-from estimators.geometry import lift, wrap_angle
+from estimators.geometry import lift
 from estimators.graph import factors
 from estimators.graph.errors import GraphError
 from estimators.graph.jumps import is_jump
@@ -138,7 +138,7 @@ class GraphSmoother(KeyframeTracker):
 
     def _follow(self, measured: PoseIncrement) -> Report:
         mean, cov = self._predicted(measured.stamp_ns)
-        nis = _motion_nis(measured, mean[REFERENCE], mean[POSE], cov)
+        nis = self._judging.motion_nis(measured, mean[REFERENCE], mean[POSE], cov)
         passes = nis <= self._increment_gate and self._take_increment(measured)
         return Report((Verdict.ACCEPTED if passes else Verdict.GATED,), np.full(1, np.nan), np.array([nis]))
 
@@ -197,7 +197,7 @@ class GraphSmoother(KeyframeTracker):
                 predicted, by_reference, by_pose = increment(earlier[POSE], later[POSE])
                 spread = by_reference @ cov_earlier[POSE, POSE] @ by_reference.T
                 spread += by_pose @ cov_later[POSE, POSE] @ by_pose.T
-                passes = _increment_nis(measured, predicted, spread) <= self._increment_gate
+                passes = self._judging.increment_nis(measured, predicted, spread) <= self._increment_gate
                 if not (passes and self._take_increment(measured)):
                     verdict = Verdict.GATED
         if measured.is_keyframe:
@@ -228,7 +228,9 @@ class GraphSmoother(KeyframeTracker):
         except GraphError:
             return Report((Verdict.GATED,))
         variable = self._window.variable(place)
-        nis = _motion_nis(measured, self._window.graph.values[variable], self._window.newest[0], cov)
+        nis = self._judging.motion_nis(
+            measured, self._window.graph.values[variable], self._window.newest[0], cov
+        )
         rows = factors.increments(variable, -1, measured.increment, measured.cov)
         passes = nis <= self._increment_gate and self._take(measured.stamp_ns, "increments", rows)
         return Report((Verdict.ACCEPTED if passes else Verdict.GATED,), np.full(1, np.nan), np.array([nis]))
@@ -327,20 +329,3 @@ class GraphSmoother(KeyframeTracker):
     def _node_of_keyframe(self, stamp_ns: int | None) -> int | None:
         node_ns = None if stamp_ns is None else self._keyframes.get(stamp_ns)
         return None if node_ns is None else self._window.node_at(node_ns)
-
-
-def _motion_nis(
-    measured: PoseIncrement | LoopClosure, reference: FloatArray, pose: FloatArray, cov: FloatArray
-) -> float:
-    """Normalised innovation squared of a motion; the covariance (9, 9) is of pose, velocity, reference."""
-    predicted, by_reference, by_pose = increment(reference, pose)
-    H = np.zeros((3, 9))
-    H[:, POSE], H[:, REFERENCE] = by_pose, by_reference
-    return _increment_nis(measured, predicted, H @ cov @ H.T)
-
-
-def _increment_nis(measured: PoseIncrement | LoopClosure, predicted: FloatArray, spread: FloatArray) -> float:
-    """Normalised innovation squared of an increment, whose prediction has a covariance (3, 3)."""
-    residual = measured.increment - predicted
-    residual[2] = wrap_angle(residual[2])
-    return float(residual @ np.linalg.solve(spread + measured.cov, residual))
