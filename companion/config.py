@@ -26,6 +26,7 @@ from drivers.errors import PortError
 from drivers.port import parse_address
 from estimators import ESTIMATORS, estimator_config_class
 from estimators.base import Setup, Start
+from estimators.lidar.loop_closure import LoopCloser
 from estimators.lidar.scan_matching import ScanMatcher
 from estimators.lidar.scan_preparation import ScanPreparation
 from estimators.messages import FloatArray
@@ -223,6 +224,7 @@ class Config(Table):
     pipeline: PipelineTable = Field(default_factory=PipelineTable)
     scan_preparation: ScanPreparation.Config = Field(default_factory=ScanPreparation.Config)
     scan_matcher: ScanMatcher.Config = Field(default_factory=ScanMatcher.Config)
+    loop_closure: LoopCloser.Config = Field(default_factory=LoopCloser.Config)
     estimator: Any = Field(
         default_factory=dict, validate_default=True, description="a table for each estimator, by name"
     )
@@ -250,11 +252,6 @@ class Config(Table):
         has_lidar = any(table.driver == "rplidar" for table in info.data.get("sensor", {}).values())
         if mavlink.obstacles and not has_lidar:
             raise ValueError("obstacles come from a LiDAR, and the site has none: set obstacles = false")
-        if has_lidar and (mavlink.inputs.odometry or mavlink.inputs.wheels):
-            raise ValueError(
-                "increments of a LiDAR and of the autopilot's link cannot be chained: set inputs.odometry "
-                "and inputs.wheels to 0, or leave the LiDAR out of the site"
-            )
         return mavlink
 
     @field_validator("estimator")

@@ -133,6 +133,7 @@ def replay(
     names: list[str],
     on_tick: Callable[[Tick, Truth | None], None] | None = None,
     on_progress: Callable[[float], None] | None = None,
+    close_loops: bool = False,
 ) -> Replay:
     """Run a log through the pipeline.
 
@@ -142,6 +143,7 @@ def replay(
         names: estimators to run side by side, the primary first.
         on_tick: called for every tick with the newest truth before it.
         on_progress: called now and then with the share of the log that is done.
+        close_loops: look for loop closures although none of the estimators has a use for them.
 
     Raises:
         UserError: the log holds no bytes of any sensor of the site.
@@ -152,7 +154,8 @@ def replay(
     result.verdicts = {name: Counter() for name in names}
     result.anchor_verdicts = {name: defaultdict(Counter) for name in names}
     result.iterations = {name: [] for name in names}
-    chain = Chain(config, begin_ns, _timed_pipeline(config, names, result.update_times), names[0])
+    pipeline = _timed_pipeline(config, names, result.update_times, close_loops)
+    chain = Chain(config, begin_ns, pipeline, names[0])
     truths: list[Truth] = []
     ticks_ns: list[int] = []
 
@@ -257,9 +260,12 @@ def summary(result: Replay) -> dict[str, object]:
     }
 
 
-def _timed_pipeline(config: Config, names: list[str], update_times: dict[str, Stopwatch]) -> Pipeline:
-    front_end, estimators = make_parts(config, names)
+def _timed_pipeline(
+    config: Config, names: list[str], update_times: dict[str, Stopwatch], close_loops: bool
+) -> Pipeline:
+    front_end, estimators, look_back = make_parts(config, names, close_loops)
     return Pipeline(
         _TimedFrontEnd(front_end, update_times["scan_matcher"]),
         {name: _TimedEstimator(estimator, update_times[name]) for name, estimator in estimators.items()},
+        look_back,
     )

@@ -68,10 +68,16 @@ def smooth(
     out.print(accuracy_table(found.replay, f"{found.replay.duration:.1f} s{errors}"))
     out.print(_anchor_table(found, anchors, biases))
     out.print(f"  frame: {found.gauge}", highlight=False, soft_wrap=True)
+    out.print(f"  loop closures: {_closures(found)}", highlight=False, soft_wrap=True)
     if anchors:
         out.print()
         out.print(anchors_toml(found), highlight=False, markup=False)
     out.print(f"  written to {folder}: {', '.join([*files, 'smooth.png'])}", highlight=False, soft_wrap=True)
+
+
+def _closures(found: "SmoothedLog") -> str:
+    smoothed = found.smoothed
+    return f"{smoothed.closures} used, {smoothed.false_closures} refused because they contradict the rest"
 
 
 def _anchor_table(found: "SmoothedLog", anchors: bool, biases: bool) -> Table:
@@ -101,6 +107,7 @@ def _summary(found: "SmoothedLog") -> dict[str, object]:
         "rmse_m": {name: accuracy.rmse for name, accuracy in accuracies.items() if accuracy is not None},
         "gauge": found.gauge,
         "solver_steps": found.smoothed.iterations,
+        "loop_closures": {"used": found.smoothed.closures, "refused": found.smoothed.false_closures},
         "anchors": {
             str(anchor_id): {
                 "position": fix.position.tolist(),
