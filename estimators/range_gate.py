@@ -59,16 +59,16 @@ class HorizontalRanges:
 
     def __init__(self, sigma: float, setup: Setup) -> None:
         self._sigma = sigma
-        self._setup = setup
+        self._anchors = {i: (anchor, setup.height_to(anchor)) for i, anchor in setup.anchors.items()}
 
     def of(self, frame: RangeFrame) -> Iterator[Verdict | tuple[FloatArray, float, float]]:
         """For each range of a frame the anchor (3,), horizontal range and its sigma [m], or what is wrong."""
         for anchor_id, slant in zip(frame.anchor_ids.tolist(), frame.ranges.tolist(), strict=True):
-            anchor = self._setup.anchors.get(anchor_id)
-            if anchor is None:
+            if anchor_id not in self._anchors:
                 yield Verdict.UNKNOWN_ANCHOR
                 continue
-            reduced = reduce_height(slant, self._sigma, self._setup.height_to(anchor))
+            anchor, height = self._anchors[anchor_id]
+            reduced = reduce_height(slant, self._sigma, height)
             yield Verdict.IMPOSSIBLE if reduced is None else (anchor, *reduced)
 
 

@@ -130,21 +130,18 @@ class Recovering:
             if placed is None or len(placed.ranges) in (tried, 0):
                 break
             tried = len(placed.ranges)
-            held = None if estimate is None else self._at_keyframe(estimate)
-            if held is not None and float(total_loss(placed, held[None])[0]) < DOUBTFUL_LOSS * tried:
-                break
+            if estimate is not None:
+                held = self._at_keyframe(estimate)
+                if float(total_loss(placed, held[None])[0]) < DOUBTFUL_LOSS * tried:
+                    break
+                # A search takes long: blocked ranges alone are no reason for one.
+                if not (self._is_young(estimate.stamp_ns) or too_short(placed, held) > MOST_TOO_SHORT):
+                    continue
             found, flaw = self._search(placed)
             note = note or flaw
             if found is None:
                 continue
-            if (
-                estimate is None
-                or held is None
-                or (
-                    _is_better(found, placed, held, estimate.planar_cov)
-                    and (self._is_young(estimate.stamp_ns) or too_short(placed, held) > MOST_TOO_SHORT)
-                )
-            ):
+            if estimate is None or _is_better(found, placed, held, estimate.planar_cov):
                 self._set(found)
                 return ""
         if estimate is not None:
