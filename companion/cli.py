@@ -246,8 +246,8 @@ def replay(
     from companion.log import Log
     from companion.replay import config_of, write_outputs
     from companion.replay import replay as run_log
-    from companion.rerun_view import RerunView
     from companion.tables import accuracy_table, anchor_table, sensor_lines
+    from companion.view.files import RerunFiles
     from estimators import ESTIMATORS
 
     opened = Log(log)
@@ -257,12 +257,17 @@ def replay(
         if name not in ESTIMATORS:
             raise UserError(f"--estimator: unknown estimator {name!r}, there are: {', '.join(ESTIMATORS)}")
     folder = folder or Path("out") / log.stem
-    view = RerunView(config, names[0], folder / "replay.rrd")
+    view = RerunFiles(config, names, folder / "replay.rrd", opened.start_ns)
     begin = time.perf_counter()
     with _progress() as progress:
         bar = progress.add_task(log.name, total=1.0)
         result = run_log(
-            opened, config, names, view.tick, lambda share: progress.update(bar, completed=share)
+            opened,
+            config,
+            names,
+            view.tick,
+            lambda share: progress.update(bar, completed=share),
+            view.chunk,
         )
         view.close()
         progress.update(bar, completed=1.0)

@@ -13,11 +13,11 @@ from companion import __version__
 from companion.config import Config, config_from_toml
 from companion.errors import UserError
 from companion.evaluate import Accuracy, Errors, Reference, compare
-from companion.log import Log, Truth
+from companion.log import Log, RawChunk, Truth
 from companion.pipeline import Chain, FrontEnd, Pipeline, Tick, make_parts
 from companion.range_log import HEADER, range_lines
 from drivers.framing import DecodeStats
-from estimators.base import Estimator, Report, Verdict
+from estimators.base import Estimator, Report, Sketch, Sketched, Verdict
 from estimators.messages import Measurement, PoseEstimate, PoseIncrement, RangeFrame, Scan
 
 
@@ -58,6 +58,9 @@ class _TimedEstimator:
 
     def pose_at(self, stamp_ns: int) -> PoseEstimate | None:
         return self._estimator.pose_at(stamp_ns)
+
+    def sketch(self) -> Sketch | None:
+        return self._estimator.sketch() if isinstance(self._estimator, Sketched) else None
 
 
 class _TimedFrontEnd:
@@ -129,6 +132,8 @@ def replay(
     names: list[str],
     on_tick: Callable[[Tick, Truth | None], None] | None = None,
     on_progress: Callable[[float], None] | None = None,
+    on_chunk: Callable[[RawChunk], None] | None = None,
+    until_ns: int | None = None,
 ) -> Replay:
     """Run a log through the pipeline.
 
@@ -138,6 +143,8 @@ def replay(
         names: estimators to run side by side, the primary first.
         on_tick: called for every tick with the newest truth before it.
         on_progress: called now and then with the share of the log that is done.
+        on_chunk: called for every chunk before it is decoded; ticks then hold the estimators' sketches.
+        until_ns: end there.
 
     Raises:
         UserError: the log holds no bytes of any sensor of the site.
@@ -147,7 +154,8 @@ def replay(
     result.update_times = {name: Stopwatch() for name in ["scan_matcher", *names]}
     result.verdicts = {name: Counter() for name in names}
     result.anchor_verdicts = {name: defaultdict(Counter) for name in names}
-    chain = Chain(config, begin_ns, _timed_pipeline(config, names, result.update_times), names[0])
+    pipeline = _timed_pipeline(config, names, result.update_times)
+    chain = Chain(config, begin_ns, pipeline, names[0], watched=on_chunk is not None)
     truths: list[Truth] = []
     ticks_ns: list[int] = []
 
@@ -177,6 +185,10 @@ def replay(
         if isinstance(record, Truth):
             truths.append(record)
             continue
+        if until_ns is not None and record.stamp_ns > until_ns:
+            break
+        if on_chunk is not None:
+            on_chunk(record)
         fed += record.source in chain.sensors
         for tick in chain.feed(record):
             take(tick)
