@@ -107,5 +107,5 @@ def _least_absolute(directions: FloatArray, residuals: FloatArray) -> FloatArray
     for _ in range(_ROUNDS):
         weights = 1.0 / np.maximum(np.abs(residuals + directions @ shift), 1e-3)
         normal = (directions * weights[:, None]).T @ directions + 1e-9 * np.eye(2)
-        shift = -np.linalg.solve(normal, (directions * weights[:, None]).T @ residuals)
+        shift = np.linalg.solve(normal, -(directions * weights[:, None]).T @ residuals).astype(np.float64)
     return shift

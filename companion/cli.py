@@ -26,11 +26,13 @@ from companion.config import default_toml, load_config, params_dir
 from companion.doctor import app as doctor
 from companion.errors import UserError
 from companion.evaluate_cli import app as evaluate_app
+from companion.review_cli import review
 from companion.smooth_cli import smooth
 
 if TYPE_CHECKING:
     from companion.live import LiveRun, LiveStatus
     from companion.sim.scenario import Scenario
+    from companion.view.viewer import Shown
 
 EXIT_BAD_INPUT = 2
 
@@ -57,6 +59,7 @@ app = typer.Typer(
 app.add_typer(doctor, name="doctor")
 app.add_typer(evaluate_app, name="evaluate", cls=_ScenarioUnlessNamed)
 app.command()(smooth)
+app.command()(review)
 out = Console(emoji=False)
 err = Console(stderr=True, highlight=False, emoji=False)
 
@@ -65,6 +68,15 @@ Scenario_ = Annotated[
 ]
 Seed = Annotated[
     int | None, typer.Option("--seed", min=0, metavar="N", help="Instead of the scenario's own seed.")
+]
+View = Annotated[
+    str,
+    typer.Option(
+        "--view",
+        metavar="WHERE",
+        help="Show it in Rerun while it runs: web (a page for a browser, see the table view), native (a "
+        "window on this computer) or off.",
+    ),
 ]
 Sets = Annotated[
     list[str] | None,
@@ -144,6 +156,7 @@ def run(
             help="pymavlink device string of the autopilot, e.g. /dev/ttyAMA0 or udpout:host:14550.",
         ),
     ] = None,
+    view: View = "off",
     sets: Sets = None,
 ) -> None:
     """Estimate live: sensors in, poses to the autopilot, everything logged. Ctrl-C ends it.
@@ -161,7 +174,7 @@ def run(
     def say(line: str) -> None:
         err.print(f"[dim]{time.monotonic() - begin:8.1f}[/]  {escape(line)}", soft_wrap=True)
 
-    live = LiveRun(config, folder, say)
+    live = LiveRun(config, folder, say, _shown(view))
     say(f"{config.site.name}: estimator {config.pipeline.estimator}, log {folder / 'raw.mcap'}")
     stop = threading.Event()
     _stop_on_signal(stop)
@@ -379,6 +392,13 @@ def _named(path: Path, kind: str) -> Path:
         names = ", ".join(sorted(p.stem for p in ours.parent.glob("*.toml")))
         raise UserError(f"no file {path} and none of that name in params/{kind}; there are: {names}")
     return ours
+
+
+def _shown(view: str) -> "Shown":
+    match view:
+        case "web" | "native" | "off":
+            return view
+    raise UserError(f"--view: {view!r} is none of web, native, off")
 
 
 def _scenario_path(name: str) -> Path:

@@ -242,11 +242,12 @@ class EventFinder:
             )
 
 
-def worst_error(errors: Errors) -> Event | None:
-    """Where a track was farthest from the truth; None without truth."""
-    if not len(errors.stamps_ns):
+def worst_error(errors: Errors, begin_ns: int) -> Event | None:
+    """Where a track was farthest from the truth since `begin_ns`; None without truth."""
+    late_enough = errors.stamps_ns >= begin_ns
+    if not late_enough.any():
         return None
-    worst = int(np.argmax(errors.distance))
+    worst = int(np.argmax(np.where(late_enough, errors.distance, -1.0)))
     sigma = float(np.sqrt(np.linalg.eigvalsh(errors.cov[worst, :2, :2])[1]))
     return Event(
         int(errors.stamps_ns[worst]),

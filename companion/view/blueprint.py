@@ -15,6 +15,7 @@ REVIEW_TRAIL, LIVE_TRAIL = 8.0, 120.0
 _MARGIN = 0.4
 """Between the outermost wall or anchor and the border of the map [m]."""
 _ERRORS = ("error/position", "error/yaw")
+_BY_ANCHOR = ("ranges/residual", "ranges/nis")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,9 +59,9 @@ def run_blueprint(run: Layout, trail: float, compares: bool) -> rrb.Blueprint:
         rrb.Horizontal(
             rrb.Vertical(
                 _map(run, trail),
-                _verdicts(run),
-                rrb.Horizontal(_health(run), _log(run), column_shares=[1.0, 2.0]),
-                row_shares=[4.2, 1.7, 1.3],
+                _lanes(run),
+                _log(run),
+                row_shares=[4.2, 2.0, 1.2],
             ),
             rrb.Vertical(*_plots(run, errors)),
             column_shares=[1.5, 1.0],
@@ -82,24 +83,12 @@ def run_blueprint(run: Layout, trail: float, compares: bool) -> rrb.Blueprint:
 
 def comparison_blueprint(runs: Sequence[Layout]) -> rrb.Blueprint:
     """Runs beside each other, under one time cursor: maps, verdicts, errors, health."""
-    columns = [
-        rrb.Vertical(
-            _map(run, REVIEW_TRAIL),
-            _verdicts(run),
-            _health(run),
-            *_plots(run, ["error/position", "ranges/residual"]),
-            _log(run),
-            row_shares=[
-                4.0,
-                1.5,
-                0.8,
-                *[1.3 for _ in _plots(run, ["error/position", "ranges/residual"])],
-                1.0,
-            ],
-            name=run.title,
-        )
-        for run in runs
-    ]
+    columns = []
+    for run in runs:
+        plots = _plots(run, ["error/position", "ranges/residual"])
+        shares = [4.0, 2.0, *(1.3 for _ in plots), 1.2]
+        parts = [_map(run, REVIEW_TRAIL), _lanes(run), *plots, _log(run)]
+        columns.append(rrb.Vertical(*parts, row_shares=shares, name=run.title))
     return _blueprint(rrb.Horizontal(*columns))
 
 
@@ -136,20 +125,20 @@ def _map(run: Layout, trail: float) -> rrb.Spatial2DView:
     )
 
 
-def _verdicts(run: Layout) -> rrb.StateTimelineView:
-    name = f"{_title(run)}verdict of {run.primary} on ranges"
-    return rrb.StateTimelineView(origin=f"{run.root}ranges/verdict", name=name)
-
-
-def _health(run: Layout) -> rrb.StateTimelineView:
-    return rrb.StateTimelineView(origin=f"{run.root}health/state", name=f"{_title(run)}health")
+def _lanes(run: Layout) -> rrb.StateTimelineView:
+    return rrb.StateTimelineView(
+        origin=run.root or "/",
+        contents=[f"+ /{run.root}health/state", f"+ /{run.root}ranges/verdict/**"],
+        name=f"{_title(run)}health, and verdict of {run.primary} on ranges",
+    )
 
 
 def _log(run: Layout) -> rrb.TextLogView:
     return rrb.TextLogView(
         origin=f"{run.root}log",
         name=f"{_title(run)}log",
-        columns=rrb.TextLogColumns(text_log_columns=["loglevel", "body"]),
+        # The time stands in the text: a column of its own would be too narrow for it.
+        columns=rrb.TextLogColumns(timeline_columns=[], text_log_columns=["loglevel", "body"]),
     )
 
 
@@ -182,9 +171,6 @@ def _plots(run: Layout, entities: Iterable[str], fits: bool = False) -> list[rrb
             )
         )
     return views
-
-
-_BY_ANCHOR = ("ranges/residual", "ranges/nis")
 
 
 def _title(run: Layout) -> str:

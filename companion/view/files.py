@@ -11,8 +11,8 @@ from companion.errors import UserError
 from companion.log import RawChunk, Truth
 from companion.pipeline import Tick
 from companion.view.blueprint import REVIEW_TRAIL, run_blueprint
+from companion.view.line import Line
 from companion.view.scene import Scene
-from companion.view.states import Line
 
 APPLICATION = "companion"
 BATCH = 600

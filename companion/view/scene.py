@@ -15,9 +15,10 @@ from companion.pipeline import Tick
 from companion.view.batch import Batch
 from companion.view.blueprint import Layout
 from companion.view.entities import Entities
+from companion.view.line import Line
 from companion.view.map_scene import MapScene
 from companion.view.plots import Plots
-from companion.view.states import Line, States
+from companion.view.states import States
 
 MEMORY_NS = 1_500_000_000
 """Poses so long before a batch are kept: the oldest beam of its first scan was measured there."""

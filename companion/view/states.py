@@ -1,8 +1,5 @@
 """What a scene says in words: the verdict on each anchor's ranges, health, and a text log."""
 
-from dataclasses import dataclass
-from typing import Literal
-
 import numpy as np
 import rerun as rr
 
@@ -10,20 +7,11 @@ from companion.config import Config
 from companion.health import Health, State
 from companion.view.batch import Batch
 from companion.view.entities import Entities
+from companion.view.line import Level, Line
 from companion.view.palette import GREY, STATES, VERDICTS, rgba
 from estimators.base import Verdict
 
-Level = Literal["INFO", "WARN", "ERROR"]
 _LEVELS: dict[State, Level] = {State.DEGRADED: "WARN", State.LOST: "ERROR"}
-
-
-@dataclass(frozen=True, slots=True)
-class Line:
-    """A line of the text log."""
-
-    stamp_ns: int
-    text: str
-    level: Level = "INFO"
 
 
 class States:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from companion.rerun_view import RerunView
 from rerun.chunk import RrdReader
 
 from companion.config import Config
@@ -16,7 +17,6 @@ from companion.errors import UserError
 from companion.log import Log, Truth
 from companion.pipeline import Tick
 from companion.replay import config_of, replay
-from companion.rerun_view import RerunView
 from companion.sim.world import World
 from estimators.base import Verdict
 from estimators.messages import FloatArray, RangeFrame, Scan
