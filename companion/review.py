@@ -82,9 +82,11 @@ def review(
         root, title = (f"{ROOTS[i]}/", f"{ROOTS[i]} {log.path.stem}") if len(logs) > 1 else ("", "")
         scene = Scene(config, chosen, stream, log.start_ns, root, title)
         scenes.append(scene)
-        result = _replay_into(
-            scene, log, config, chosen, span, lambda share, i=i: on_progress((i + share) / len(logs)), arrange
-        )
+
+        def progress(share: float, before: int = i) -> None:
+            on_progress((before + share) / len(logs))
+
+        result = _replay_into(scene, log, config, chosen, span, progress, arrange)
         reviews.append(Review(log, result, _events(scene, result, log, span)))
     arrange()
     return reviews

@@ -1,6 +1,5 @@
 """`companion review`: a log replayed into Rerun, with a list of what happened and when."""
 
-import os
 import signal
 import threading
 import time
@@ -19,7 +18,6 @@ from companion.errors import UserError
 if TYPE_CHECKING:
     import rerun as rr
 
-    from companion.log import Log
     from companion.review import Review
     from companion.view.viewer import Viewer
 

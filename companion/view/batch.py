@@ -9,7 +9,7 @@ from companion.log import Truth
 from companion.pipeline import Tick
 from estimators.base import Report
 from estimators.geometry import wrap_angles
-from estimators.messages import FloatArray, IntArray, Measurement, RangeFrame, Scan
+from estimators.messages import FloatArray, IntArray, RangeFrame, Scan
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,7 +36,7 @@ class Batch:
     """Ticks with what came before them, so that scans and steps across the seam are whole.
 
     Args:
-        primary: estimator whose verdicts are shown.
+        names: estimators, the primary first, whose verdicts are shown.
         before: ticks that were drawn already, and are only asked for poses.
         ticks: to be drawn.
         truths: newest true poses, as far as they are known.
@@ -50,28 +50,25 @@ class Batch:
         new: which of all ticks are to be drawn.
         frames: ranges taken in these ticks with the primary's report.
         scans: of these ticks, those without a beam left out.
-        measured: every measurement of these ticks.
     """
 
     def __init__(
-        self, primary: str, before: list[Tick], ticks: list[Tick], truths: list[Truth], after: Tick | None
+        self, names: list[str], before: list[Tick], ticks: list[Tick], truths: list[Truth], after: Tick | None
     ) -> None:
         everything = before + ticks + ([after] if after is not None else [])
         self.ticks = ticks
         self.before = before
         self.new = slice(len(before), len(before) + len(ticks))
         self.stamps_ns = np.array([tick.stamp_ns for tick in ticks], dtype=np.int64)
-        self.names = [primary, *(name for name in ticks[0].poses if name != primary)]
+        self.names = names
         self.tracks = {name: _track(everything, name) for name in self.names}
         self.truths = truths
         self.frames: list[tuple[RangeFrame, Report]] = []
         self.scans: list[Scan] = []
-        self.measured: list[Measurement] = []
         for tick in ticks:
             for outcome in tick.outcomes:
-                self.measured.append(outcome.measurement)
-                if isinstance(outcome.measurement, RangeFrame):
-                    self.frames.append((outcome.measurement, outcome.reports[primary]))
+                    if isinstance(outcome.measurement, RangeFrame):
+                    self.frames.append((outcome.measurement, outcome.reports[names[0]]))
                 elif isinstance(outcome.measurement, Scan) and len(outcome.measurement.ranges):
                     self.scans.append(outcome.measurement)
 

@@ -40,6 +40,10 @@ class Entities:
             self._styled.add(path)
             self.static(path, archetype)
 
+    def seconds(self, stamp_ns: int) -> float:
+        """Time since the start of the run [s]."""
+        return (stamp_ns - self._start_ns) * 1e-9
+
     def columns(self, path: str, stamps_ns: IntArray, columns: rr.ComponentColumnList) -> None:
         """Rows of an entity; the frame of a row is the tick that followed its time."""
         if len(stamps_ns):

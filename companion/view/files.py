@@ -72,10 +72,9 @@ class RerunFiles:
         Raises:
             UserError: the file cannot be written, as on a full disk.
         """
-        try:
-            self._write(self._end)
-        finally:
-            self._stream.disconnect()
+        # After an error a stream waits for its broken writer for ever: it is left as it is.
+        self._write(self._end)
+        self._stream.disconnect()
 
     def _end(self) -> None:
         self._scene.close()

@@ -128,7 +128,7 @@ class Scene:
         )
 
     def _draw(self, ticks: list[Tick], after: Tick | None) -> None:
-        batch = Batch(self._names[0], self._before, ticks, self._truths, after)
+        batch = Batch(self._names, self._before, ticks, self._truths, after)
         self._map.send(batch)
         self._plots.send(batch)
         self._states.send(batch)

@@ -58,7 +58,10 @@ class States:
     def say(self, lines: list[Line]) -> None:
         """Write lines of the text log."""
         stamps_ns = np.array([line.stamp_ns for line in lines])
-        columns = rr.TextLog.columns(text=[line.text for line in lines], level=[line.level for line in lines])
+        columns = rr.TextLog.columns(
+            text=[f"{self._entities.seconds(line.stamp_ns):.2f} s  {line.text}" for line in lines],
+            level=[line.level for line in lines],
+        )
         self._entities.columns("log", stamps_ns, columns)
 
     def _send_verdicts(self, batch: Batch) -> None:
