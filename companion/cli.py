@@ -1,8 +1,6 @@
 """The commands. Data goes to files or stdout, progress and messages to stderr."""
 
-import json
 import logging
-import os
 import signal
 import sys
 import threading
@@ -22,15 +20,19 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 from typer.core import TyperGroup
 
 from companion import __version__
-from companion.config import default_toml, load_config, params_dir
+from companion.calibrate_cli import app as calibrate_app
 from companion.doctor import app as doctor
 from companion.errors import UserError
 from companion.evaluate_cli import app as evaluate_app
+from companion.params_cli import app as params_app
 from companion.review_cli import review
+from companion.sitl_cli import sitl
 from companion.smooth_cli import smooth
 
 if TYPE_CHECKING:
+    from companion.config import Config
     from companion.live import LiveRun, LiveStatus
+    from companion.log import Log
     from companion.sim.scenario import Scenario
     from companion.view.viewer import Shown
 
@@ -57,6 +59,9 @@ app = typer.Typer(
     add_completion=False,
 )
 app.add_typer(doctor, name="doctor")
+app.add_typer(params_app, name="params")
+app.add_typer(calibrate_app, name="calibrate")
+app.command()(sitl)
 app.add_typer(evaluate_app, name="evaluate", cls=_ScenarioUnlessNamed)
 app.command()(smooth)
 app.command()(review)
@@ -153,7 +158,7 @@ def run(
         typer.Option(
             "--mavlink",
             metavar="URL",
-            help="pymavlink device string of the autopilot, e.g. /dev/ttyAMA0 or udpout:host:14550.",
+            help="Device string of the autopilot, /dev/ttyAMA0,921600 or udpout:host:14550 or tcp:host:5760.",
         ),
     ] = None,
     view: View = "off",
@@ -164,17 +169,22 @@ def run(
     Missing ports and a missing autopilot are waited for, and taken up again after an unplug. A pose is only
     sent while its health is ok or degraded.
     """
+    from companion.config import load_config, named_file
     from companion.live import LiveRun
+    from companion.mavlink.parameters import saved_settings
 
     assignments = [*(sets or []), *([f"mavlink.url={mavlink}"] if mavlink is not None else [])]
-    config = load_config(_named(site, "sites"), assignments)
+    config = load_config(named_file(site, "sites"), assignments)
+    if config.mavlink.parameter_file:
+        saved = saved_settings(Path(config.mavlink.parameter_file))
+        config = load_config(named_file(site, "sites"), [*saved, *assignments])
     folder = folder or Path("out") / datetime.now().astimezone().strftime("run-%Y%m%d-%H%M%S")
     begin = time.monotonic()
 
     def say(line: str) -> None:
         err.print(f"[dim]{time.monotonic() - begin:8.1f}[/]  {escape(line)}", soft_wrap=True)
 
-    live = LiveRun(config, folder, say, _shown(view))
+    live = LiveRun(config, folder, say, view=_shown(view))
     say(f"{config.site.name}: estimator {config.pipeline.estimator}, log {folder / 'raw.mcap'}")
     stop = threading.Event()
     _stop_on_signal(stop)
@@ -248,6 +258,14 @@ def replay(
         Path | None,
         typer.Option("--site", metavar="FILE", help="Site file instead of the log's own settings."),
     ] = None,
+    mavlink: Annotated[
+        str | None,
+        typer.Option("--mavlink", metavar="URL", help="Send the poses to an autopilot, in real time."),
+    ] = None,
+    speed: Annotated[
+        float,
+        typer.Option("--speed", min=0.1, max=10.0, metavar="X", help="With --mavlink: X times as fast."),
+    ] = 1.0,
     sets: Sets = None,
 ) -> None:
     """Run a log through the very same decoders and estimators as live, without sleeping.
@@ -256,6 +274,7 @@ def replay(
     The same log and settings give the same poses, byte for byte. The settings are those stored in the log;
     change them with --set, or give a corrected site file with --site.
     """
+    from companion.config import load_config, named_file
     from companion.log import Log
     from companion.replay import config_of, write_outputs
     from companion.replay import replay as run_log
@@ -264,11 +283,16 @@ def replay(
     from estimators import ESTIMATORS
 
     opened = Log(log)
-    config = load_config(_named(site, "sites"), sets or []) if site else config_of(opened, sets or [])
+    if mavlink is not None:
+        sets = [*(sets or []), f"mavlink.url={mavlink}"]
+    config = load_config(named_file(site, "sites"), sets or []) if site else config_of(opened, sets or [])
     names = list(dict.fromkeys(estimator or [config.pipeline.estimator]))
     for name in names:
         if name not in ESTIMATORS:
             raise UserError(f"--estimator: unknown estimator {name!r}, there are: {', '.join(ESTIMATORS)}")
+    if mavlink is not None:
+        _play(opened, config, names[0], speed)
+        return
     folder = folder or Path("out") / log.stem
     view = RerunFiles(config, names, folder / "replay.rrd", opened.start_ns)
     begin = time.perf_counter()
@@ -299,59 +323,165 @@ def replay(
     )
 
 
-@evaluate_app.command("scenario")
-def evaluate(
-    scenario: Scenario_,
-    trials: Annotated[int, typer.Option("--trials", min=1, metavar="N", help="Number of runs.")] = 30,
-    seed: Seed = None,
-    estimators: Annotated[
+@app.command("map")
+def make_map(
+    log: Annotated[Path, typer.Argument(metavar="LOG", help="Log (MCAP) of a run, demo or simulation.")],
+    out_file: Annotated[
+        Path, typer.Option("--out", metavar="FILE", help="Map (YAML) to write, with a PNG beside it.")
+    ] = Path("map.yaml"),
+    estimator: Annotated[
         str | None,
-        typer.Option(
-            "--estimators",
-            metavar="A,B",
-            help="Estimators, NAME or NAME:PARAM; uwb_ls and lidar are the single sensors. "
-            "Default: uwb_ls,lidar,ekf.",
-        ),
-    ] = None,
-    json_file: Annotated[
-        Path | None, typer.Option("--json", metavar="FILE", help="Write the figures there, too.")
-    ] = None,
-    workers: Annotated[
-        int | None, typer.Option("--workers", min=1, metavar="N", help="Processes; default: one a core.")
+        typer.Option("--estimator", metavar="NAME", help="Whose poses are used. Default: the log's."),
     ] = None,
     sets: Sets = None,
 ) -> None:
-    """Measure estimators on many trials of a scenario: errors, consistency, time, distance from the bound.
+    """Make a floor plan of what the LiDAR saw in a log, as a picture and a YAML file.
 
-    The word "scenario" may be left out: [bold]companion evaluate huang2024[/]. Trial k has the seed S + k
-    for everything random: obstacles, start, gait and noise. The same seed gives the same figures, times
-    excepted. Where the scenario holds figures of a paper, they stand below ours.
+    The files follow the convention of the ROS map_server, which other tools read, too.
     """
-    from companion.evaluation import DEFAULT_CHOICES, evaluate_scenario
-    from companion.evaluation_table import evaluation_notes, evaluation_table
+    from companion.log import Log
+    from companion.map_file import save_map
+    from companion.mapping import survey
+    from companion.replay import config_of
+    from estimators import ESTIMATORS
 
-    choices = DEFAULT_CHOICES if estimators is None else estimators.split(",")
-    if json_file is not None and not json_file.parent.is_dir():
-        raise UserError(f"cannot write {json_file}: there is no folder {json_file.parent}")
+    if out_file.suffix not in (".yaml", ".yml"):
+        raise UserError(f"--out {out_file}: the name must end in .yaml")
+    opened = Log(log)
+    config = config_of(opened, sets or [])
+    name = estimator or config.pipeline.estimator
+    if name not in ESTIMATORS:
+        raise UserError(f"--estimator: unknown estimator {name!r}, there are: {', '.join(ESTIMATORS)}")
     with _progress() as progress:
-        bar = progress.add_task("trials", total=trials)
-        result = evaluate_scenario(
-            _scenario_path(scenario),
-            trials,
-            seed,
-            choices,
-            sets or [],
-            workers or os.cpu_count() or 1,
-            lambda: progress.advance(bar),
-        )
-    out.print(evaluation_table(result))
-    for line in evaluation_notes(result):
-        out.print(f"  {line}", highlight=False, soft_wrap=True)
-    if json_file is not None:
-        try:
-            json_file.write_text(json.dumps(result.to_json(), indent=2) + "\n", encoding="utf-8")
-        except OSError as error:
-            raise UserError(f"cannot write {json_file}: {error.strerror}") from error
+        bar = progress.add_task(log.name, total=1.0)
+        made = survey(opened, config, name, lambda share: progress.update(bar, completed=share))
+        progress.update(bar, completed=1.0)
+    save_map(made.floor, out_file)
+    rows, columns = made.floor.occupied.shape
+    cell = made.floor.cell
+    out.print(
+        f"{out_file}  {columns * cell:.1f} m x {rows * cell:.1f} m in cells of {cell:g} m, "
+        f"{made.inserted} of {made.scans} scans",
+        highlight=False,
+        soft_wrap=True,
+    )
+
+
+@app.command()
+def edit(
+    log: Annotated[Path, typer.Argument(metavar="LOG", help="Log (MCAP) to read.")],
+    fault: Annotated[
+        list[str],
+        typer.Option("--fault", metavar="KIND:KEY=VALUE,...", help="What goes wrong. Repeatable."),
+    ],
+    path: Annotated[Path, typer.Option("--out", metavar="LOG", help="Log (MCAP) to write.")],
+    seed: Seed = None,
+) -> None:
+    """Write a log as it would be had something gone wrong: what if anchor 3 dies at 20 s?
+
+    [bold]companion edit raw.mcap --fault drop:anchor=3,at=20 --out what_if.mcap[/], then replay what_if.mcap.
+    Every fault has at= and for= [s]. silent (sensor), late (sensor, by [s]), drop (anchor), spike (anchor,
+    size [m], share), nlos (anchor, least, mean [m]), moved (anchor, x, y, z [m]; needs truth), clock (by [s]:
+    the tag's clock jumps), rotated (yaw_deg: the tag in its mount), blocked (from_deg, to_deg, distance: a
+    sector of the LiDAR), gone (share of LiDAR beams without return).
+    """
+    from companion.log import Log
+    from companion.log_edit.edit import edit_log
+    from companion.log_edit.faults import parse_fault
+    from companion.replay import config_of
+
+    opened = Log(log)
+    config = config_of(opened, [])
+    edit_log(opened, config, [parse_fault(text, config) for text in fault], seed or 0, path)
+    out.print(f"{path}  replay it with: companion replay {path}", highlight=False, soft_wrap=True)
+
+
+@app.command()
+def plan(
+    site: Annotated[
+        Path, typer.Argument(metavar="SITE", help="Site file with walls, or the name of one in params/sites.")
+    ],
+    scenario: Annotated[
+        str | None,
+        typer.Option("--scenario", metavar="NAME", help="Take furniture from the boxes of this scenario."),
+    ] = None,
+    limit: Annotated[
+        float, typer.Option("--limit", min=0.001, metavar="M", help="Position error that is still good [m].")
+    ] = 0.2,
+    sigma: Annotated[
+        float | None,
+        typer.Option("--sigma", min=0.001, metavar="M", help="Range noise [m]; default: that of ekf."),
+    ] = None,
+    folder: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for plan.png.")] = Path(
+        "out/plan"
+    ),
+    sets: Sets = None,
+) -> None:
+    """Say how accurate ranges can be over the floor, where they are bad, where one more anchor helps most.
+
+    Walls and furniture block ranges, and a blocked range does not count. The error is the least that a single
+    frame of ranges allows (Cramer-Rao): a filter with a LiDAR does better, nothing without memory does.
+    """
+    from companion.config import load_config, named_file
+    from companion.plan import plan_layout
+    from companion.plan_plot import plan_figure
+    from companion.sim.scenario import load_scenario
+
+    config = load_config(named_file(site, "sites"), sets or [])
+    world = load_scenario(_scenario_path(scenario), None, []).world if scenario else None
+    layout = plan_layout(config, world, limit, sigma)
+    plan_figure(layout, config, folder / "plan.png")
+    for line in layout.lines():
+        out.print(line, highlight=False, soft_wrap=True)
+    out.print(f"picture  {folder / 'plan.png'}", highlight=False, soft_wrap=True)
+
+
+@app.command("import")
+def import_recording(
+    source: Annotated[
+        Path,
+        typer.Argument(
+            metavar="SOURCE",
+            help="Folder of a public data set (lias_planar, labyrinth_uwb, robotino_uwb) or of text files as "
+            "export writes them, CARMEN log, ROS 1 or 2 bag.",
+        ),
+    ],
+    path: Annotated[Path, typer.Option("--out", metavar="LOG", help="Log (MCAP) to write.")],
+    site: Annotated[
+        Path | None,
+        typer.Option("--site", metavar="FILE", help="Site file; we have one for each of the data sets."),
+    ] = None,
+    truth: Annotated[
+        str | None,
+        typer.Option("--truth", metavar="TOPIC", help="Odometry or PoseStamped of a bag to compare with."),
+    ] = None,
+    sets: Sets = None,
+) -> None:
+    """Make a log of somebody else's recording, in the bytes that our sensors would have sent.
+
+    Ranges become LinkTrack frames, scans RPLIDAR packets: replay and evaluate take the one path that a
+    robot takes.
+    """
+    from companion.config import named_file
+    from companion.importers.sources import import_log
+
+    count = import_log(source, path, site and named_file(site, "sites"), sets, truth)
+    out.print(f"{path}  {count} measurements", highlight=False, soft_wrap=True)
+
+
+@app.command()
+def export(
+    log: Annotated[Path, typer.Argument(metavar="LOG", help="Log (MCAP).")],
+    folder: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to write.")],
+) -> None:
+    """Write what a log holds as text: ranges.csv, scans.csv, imu.csv, truth.tum."""
+    from companion.importers.text_folder import write_folder
+    from companion.log import Log
+    from companion.replay import config_of
+
+    opened = Log(log)
+    for path in write_folder(opened, config_of(opened, []), folder):
+        out.print(str(path), highlight=False, soft_wrap=True)
 
 
 @app.command("dump-config")
@@ -362,12 +492,14 @@ def dump_config(
     sets: Sets = None,
 ) -> None:
     """Print every setting with its default, or a site's whole configuration, as TOML."""
+    from companion.config import default_toml, load_config, named_file
+
     if site is None:
         if sets:
             raise UserError("--set: give --site too; the defaults alone are no configuration to change")
         sys.stdout.write(default_toml())
     else:
-        sys.stdout.write(load_config(_named(site, "sites"), sets or []).to_toml())
+        sys.stdout.write(load_config(named_file(site, "sites"), sets or []).to_toml())
 
 
 def main() -> NoReturn:
@@ -383,17 +515,6 @@ def main() -> NoReturn:
     sys.exit(0)
 
 
-def _named(path: Path, kind: str) -> Path:
-    """A file of the user's, or one of ours in `params/KIND` by its bare name."""
-    if path.exists() or path.suffix or path.name != str(path):
-        return path
-    ours = params_dir() / kind / f"{path}.toml"
-    if not ours.exists():
-        names = ", ".join(sorted(p.stem for p in ours.parent.glob("*.toml")))
-        raise UserError(f"no file {path} and none of that name in params/{kind}; there are: {names}")
-    return ours
-
-
 def _shown(view: str) -> "Shown":
     match view:
         case "web" | "native" | "off":
@@ -402,7 +523,9 @@ def _shown(view: str) -> "Shown":
 
 
 def _scenario_path(name: str) -> Path:
-    return _named(Path(name), "scenarios")
+    from companion.config import named_file
+
+    return named_file(Path(name), "scenarios")
 
 
 def _load_scenario(name: str, seed: int | None, sets: list[str] | None) -> "Scenario":
@@ -428,6 +551,17 @@ def _progress() -> Iterator[Progress]:
         disable=not err.is_terminal,
     ) as progress:
         yield progress
+
+
+def _play(log: "Log", config: "Config", primary: str, speed: float) -> None:
+    """Send a log's poses to an autopilot and print how well it followed."""
+    from companion.replay_out import Player
+
+    player = Player(log, config, primary, speed, lambda line: err.print(line, markup=False, soft_wrap=True))
+    player.play()
+    out.print(f"{player.poses_sent} poses sent", highlight=False)
+    for line in player.score.lines():
+        out.print(line, highlight=False, markup=False, soft_wrap=True)
 
 
 def _stop_on_signal(stop: threading.Event) -> None:

@@ -15,19 +15,23 @@ from pydantic import (
     Field,
     IPvAnyAddress,
     ValidationError,
+    ValidationInfo,
     create_model,
     field_validator,
     model_validator,
 )
 
 from companion.errors import UserError
+from companion.mavlink_table import MavlinkTable
 from drivers import SENSORS, sensor_config_class
 from drivers.errors import PortError
 from drivers.port import parse_address
 from estimators import ESTIMATORS, estimator_config_class
 from estimators.base import Setup, Start
 from estimators.lidar.scan_matching import ScanMatcher
+from estimators.lidar.scan_preparation import ScanPreparation
 from estimators.messages import FloatArray
+from estimators.models.range_bias import RangeBias
 from estimators.relocation.recovery import Recovering
 from estimators.trilateration import AnchorGeometryError, check_anchor_geometry
 
@@ -43,6 +47,14 @@ class Table(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
+class OriginTable(Table):
+    """Where on Earth the map's origin is: an autopilot without GPS takes it from here."""
+
+    lat: float = Field(ge=-90, le=90, description="latitude, WGS 84, north is positive [deg]")
+    lon: float = Field(ge=-180, le=180, description="longitude, WGS 84, east is positive [deg]")
+    alt: float = Field(0.0, ge=-1000, le=10_000, description="above mean sea level [m]")
+
+
 class SiteTable(Table):
     """The place."""
 
@@ -55,6 +67,7 @@ class SiteTable(Table):
         description="polylines of walls, for views and for particle filters with scan_likelihood, which hold "
         "scans against them [m]",
     )
+    origin: OriginTable | None = Field(None, description="where the map's origin is on Earth")
 
 
 class BodyTable(Table):
@@ -103,6 +116,24 @@ class StartTable(Table):
         yaw, yaw_sigma = np.deg2rad([self.yaw_deg, self.sigma_yaw_deg])
         pose = np.array([self.x, self.y, yaw])
         return Start(pose, np.array([self.sigma_xy, self.sigma_xy, yaw_sigma]), self.still_for)
+
+
+class AnchorBiasTable(Table):
+    """How much longer than the common bias one anchor's ranges are, as `companion calibrate ranges` found."""
+
+    constant: float = Field(0.0, ge=-10, le=10, description="beyond the common bias, at `distance` [m]")
+    constant_sigma: float = Field(0.0, ge=0, le=10, description="standard deviation of it [m]")
+    per_metre: float = Field(0.0, ge=-0.2, le=0.2, description="growth with the distance [m/m]")
+    per_metre_sigma: float = Field(0.0, ge=0, le=1, description="standard deviation of it [m/m]")
+    distance: float = Field(0.0, ge=0, le=1000, description="where `constant` holds [m]")
+
+
+class RangeBiasTable(Table):
+    """What is taken off every range before anything else uses it."""
+
+    common: float = Field(0.0, ge=-10, le=10, description="of all anchors: c times the time bias [m]")
+    common_sigma: float = Field(0.0, ge=0, le=10, description="standard deviation of it [m]")
+    anchors: dict[int, AnchorBiasTable] = Field({}, description="by the id of the anchor")
 
 
 class SensorTable(Table):
@@ -167,6 +198,9 @@ class HealthTable(Table):
     max_increment_age: float = Field(
         1.0, gt=0, le=60, description="degraded when no LiDAR increment was accepted for so long [s]"
     )
+    max_dead_reckoning: float = Field(
+        20.0, gt=0, le=3600, description="lost when no range was accepted for so long, whatever the sigma [s]"
+    )
     min_accepted_share: float = Field(
         0.3, ge=0, le=0.6, description="lost when a smaller share of recent ranges agrees with the pose"
     )
@@ -177,17 +211,6 @@ class HealthTable(Table):
         description="lost when a larger share of recent ranges is gated as too short: what blocks a range "
         "only lengthens it, so the pose must be wrong",
     )
-
-
-class MavlinkTable(Table):
-    """The link to the autopilot."""
-
-    url: str = Field("udpout:127.0.0.1:14550", description="pymavlink device string, or empty for none")
-    baud: int = Field(921600, ge=1200, le=4_000_000, description="baud of a serial link")
-    system_id: int = Field(
-        1, ge=1, le=255, description="system id until the autopilot's own HEARTBEAT is heard"
-    )
-    component_id: int = Field(197, ge=1, le=255, description="197 is MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY")
 
 
 class ViewTable(Table):
@@ -220,7 +243,9 @@ class Config(Table):
     body: BodyTable = Field(default_factory=BodyTable)
     start: StartTable
     sensor: dict[str, SensorTable] = Field(min_length=1)
+    range_bias: RangeBiasTable = Field(default_factory=RangeBiasTable)
     pipeline: PipelineTable = Field(default_factory=PipelineTable)
+    scan_preparation: ScanPreparation.Config = Field(default_factory=ScanPreparation.Config)
     scan_matcher: ScanMatcher.Config = Field(default_factory=ScanMatcher.Config)
     estimator: Any = Field(
         default_factory=dict, validate_default=True, description="a table for each estimator, by name"
@@ -238,6 +263,22 @@ class Config(Table):
         except AnchorGeometryError as error:
             raise ValueError(str(error)) from error
         return anchors
+
+    @field_validator("mavlink")
+    @classmethod
+    def _fits_the_site(cls, mavlink: MavlinkTable, info: ValidationInfo) -> MavlinkTable:
+        origin = info.data["site"].origin if "site" in info.data else None
+        if mavlink.raw_ranges and (origin is None or mavlink.align != "site"):
+            raise ValueError(
+                'raw_ranges give anchors by latitude and longitude: set site.origin, align = "site"'
+            )
+        has_lidar = any(table.driver == "rplidar" for table in info.data.get("sensor", {}).values())
+        if has_lidar and (mavlink.inputs.odometry or mavlink.inputs.wheels):
+            raise ValueError(
+                "increments of a LiDAR and of the autopilot's link cannot be chained: set inputs.odometry "
+                "and inputs.wheels to 0, or leave the LiDAR out of the site"
+            )
+        return mavlink
 
     @field_validator("estimator")
     @classmethod
@@ -277,6 +318,17 @@ class Config(Table):
             walls=[np.array(wall) for wall in self.site.walls],
             lidar_in_body=self.lidar_mounting(),
         )
+
+    def range_biases(self) -> dict[int, RangeBias]:
+        """Bias by anchor id; empty when none is known."""
+        table = self.range_bias
+        if not table.common and not table.anchors:
+            return {}
+        single = {i: table.anchors.get(i, AnchorBiasTable()) for i in self.anchors}
+        return {
+            i: RangeBias(table.common + bias.constant, bias.per_metre, bias.distance)
+            for i, bias in single.items()
+        }
 
     def lidar_mounting(self) -> FloatArray:
         """`T_body_lidar`, (3,): x [m], y [m], yaw [rad] in the body frame."""
@@ -397,6 +449,21 @@ def params_dir() -> Path:
     """Folder of the files that ship with the project: `params/` of a checkout, or its copy in a wheel."""
     here = Path(__file__).parent
     return next(p for p in (here / "_params", here.parent / "params") if p.is_dir())
+
+
+def named_file(path: Path, kind: str) -> Path:
+    """A file of the user's, or one of ours in `params/KIND` by its bare name.
+
+    Raises:
+        UserError: a bare name that neither has.
+    """
+    if path.exists() or path.suffix or path.name != str(path):
+        return path
+    ours = params_dir() / kind / f"{path}.toml"
+    if not ours.exists():
+        names = ", ".join(sorted(p.stem for p in ours.parent.glob("*.toml")))
+        raise UserError(f"no file {path} and none of that name in params/{kind}; there are: {names}")
+    return ours
 
 
 @cache

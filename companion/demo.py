@@ -81,16 +81,16 @@ def _fly(scenario: Scenario, path: Path, autopilot: EmulatedAutopilot) -> Iterat
     config = scenario.config
     primary = config.pipeline.estimator
     chain = Chain(config, START_NS, make_pipeline(config, [primary]), primary)
-    session = MavlinkSession(config.mavlink, config.map_heading())
+    session = MavlinkSession(config)
     writer = LogWriter(path, config.to_toml(), START_NS)
 
     def give_out(tick: Tick) -> None:
         heard = autopilot.poll(tick.stamp_ns)
         if heard:
             writer.raw(RawChunk(MAVLINK, Direction.IN, tick.stamp_ns, heard))
-            session.receive(heard)
-        data = session.tick(tick.poses[primary], tick.health, tick.stamp_ns)
-        if data:
+            session.receive(MAVLINK, heard, tick.stamp_ns, tick.stamp_ns)
+        session.tick(tick.poses[primary], tick.health, tick.stamp_ns)
+        if data := session.take().get(MAVLINK):
             writer.raw(RawChunk(MAVLINK, Direction.OUT, tick.stamp_ns, data))
             autopilot.feed(data)
 

@@ -9,6 +9,7 @@ from rich.table import Table
 from rich.text import Text
 
 from companion.errors import UserError
+from companion.frames_cli import frames
 
 EXIT_NOTHING_FOUND = 1
 NOTHING_THERE = """no serial port found. Check:
@@ -22,9 +23,7 @@ app = typer.Typer(
 )
 
 
-@app.callback()
-def _group() -> None:
-    """A callback keeps `ports` a command of its own while there is no other."""
+app.command()(frames)
 
 
 @app.command()

@@ -1,17 +1,206 @@
 """`companion evaluate`: how good the algorithms are, measured."""
 
+import atexit
 import json
 import os
+from functools import partial
 from pathlib import Path
-from typing import Annotated
+from shutil import rmtree
+from tempfile import mkdtemp
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from companion.alignment import Alignment
 from companion.errors import UserError
 
+if TYPE_CHECKING:
+    from companion.evaluation import Evaluation
+
+_TABLE_WIDTH = 100
+"""Of what goes to a file, where there is no terminal to fit into."""
+
 app = typer.Typer(help="Measure how good the algorithms are.", no_args_is_help=True, rich_markup_mode="rich")
+
+
+@app.command("scenario")
+def scenario(
+    sources: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="SOURCE...",
+            help="Scenario file, name of one in params/scenarios, log (MCAP) with truth, data set's folder.",
+        ),
+    ],
+    trials: Annotated[
+        int, typer.Option("--trials", min=1, metavar="N", help="Number of runs of each scenario.")
+    ] = 30,
+    seed: Annotated[
+        int | None, typer.Option("--seed", min=0, metavar="N", help="Instead of the scenario's own seed.")
+    ] = None,
+    estimators: Annotated[
+        str | None,
+        typer.Option(
+            "--estimators",
+            metavar="A,B",
+            help="Estimators, NAME or NAME:PARAM; uwb_ls and lidar are the single sensors. "
+            "Default: uwb_ls,lidar,ekf.",
+        ),
+    ] = None,
+    align: Annotated[
+        Alignment, typer.Option("--align", help="How tracks are moved onto the truth for the ATE.")
+    ] = Alignment.NONE,
+    json_file: Annotated[
+        Path | None, typer.Option("--json", metavar="FILE", help="Write the figures there, too.")
+    ] = None,
+    folder: Annotated[
+        Path | None,
+        typer.Option(
+            "--out", metavar="DIR", help="Write report.md, pictures, and the worst trial as a log there."
+        ),
+    ] = None,
+    workers: Annotated[
+        int | None, typer.Option("--workers", min=1, metavar="N", help="Processes; default: one a core.")
+    ] = None,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(
+            "--scheduler",
+            metavar="URL",
+            help="Dask scheduler (tcp://host:8786) whose workers, with this program and the same files, run "
+            "the trials. Needs the extra cluster.",
+        ),
+    ] = None,
+    fault: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--fault",
+            metavar="KIND:KEY=VALUE,...",
+            help="Put a fault into every trial (see companion edit --help); repeat it for several at once. "
+            "library: one evaluation for every sort of fault.",
+        ),
+    ] = None,
+    sets: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set", metavar="KEY=VALUE", help="Change one setting of the site, e.g. --set pipeline.rate=20."
+        ),
+    ] = None,
+) -> None:
+    """Measure estimators on many trials of scenarios, or on logs: errors, consistency, time, integrity.
+
+    The word "scenario" may be left out: [bold]companion evaluate huang2024[/]. Trial k has the seed S + k
+    for everything random: obstacles, start, gait and noise. The same seed gives the same figures, times
+    excepted. Where the scenario holds figures of a paper, they stand below ours. Ctrl-C ends it and keeps
+    the trials that are done (exit code 1).
+    """
+    from companion.config import named_file
+    from companion.evaluation import DEFAULT_CHOICES, evaluate_scenario
+    from companion.evaluation_table import evaluation_notes, evaluation_table, leg_table, trust_table
+    from companion.log_trial import LOG_SUFFIX
+
+    out, err = Console(emoji=False), Console(stderr=True, highlight=False, soft_wrap=True, emoji=False)
+    if not out.is_terminal:
+        out.width = max(out.width, _TABLE_WIDTH)
+    choices = DEFAULT_CHOICES if estimators is None else estimators.split(",")
+    if folder is not None:
+        _make_writable(folder / "report.md")
+    if json_file is not None and not json_file.parent.is_dir():
+        raise UserError(f"cannot write {json_file}: there is no folder {json_file.parent}")
+    paths = [_imported(named_file(Path(source), "scenarios"), sets or []) for source in sources]
+    results: list[Evaluation] = []
+    for path, faults in _runs(paths, fault or [], sets or []):
+        with _progress(err) as progress:
+            count = 1 if path.suffix == LOG_SUFFIX and not faults else trials
+            bar = progress.add_task(path.stem, total=count)
+            results.append(
+                evaluate_scenario(
+                    path,
+                    trials,
+                    seed,
+                    choices,
+                    sets or [],
+                    workers or os.cpu_count() or 1,
+                    partial(progress.advance, bar),
+                    align,
+                    scheduler,
+                    faults,
+                )
+            )
+        result = results[-1]
+        out.print(evaluation_table(result))
+        out.print(trust_table(result))
+        if (legs := leg_table(result)) is not None:
+            out.print(legs)
+        for line in evaluation_notes(result):
+            out.print(f"  {line}", highlight=False, soft_wrap=True)
+        if folder is not None:
+            for line in _write_report(results, path, folder, sets or [], faults):
+                out.print(f"  {line}", highlight=False, soft_wrap=True)
+        if result.interrupted:
+            err.print(f"[yellow]interrupted: {path} has {result.trials} of {count} trials[/]")
+            break
+    if json_file is not None:
+        figures = [result.to_json() for result in results]
+        try:
+            text = json.dumps(figures[0] if len(figures) == 1 else figures, indent=2)
+            json_file.write_text(text + "\n", encoding="utf-8")
+        except OSError as error:
+            raise UserError(f"cannot write {json_file}: {error.strerror}") from error
+    if results[-1].interrupted:
+        raise typer.Exit(1)
+
+
+def _imported(path: Path, sets: list[str]) -> Path:
+    """The source itself, or for the folder of a data set the log that is made of it."""
+    if not path.is_dir():
+        return path
+    from companion.importers.sources import import_log
+
+    folder = mkdtemp(prefix="companion-")
+    atexit.register(rmtree, folder)
+    log = Path(folder) / f"{path.name}.mcap"
+    import_log(path, log, sets=sets)
+    return log
+
+
+def _runs(paths: list[Path], faults: list[str], sets: list[str]) -> list[tuple[Path, list[str]]]:
+    """What is to be evaluated: source and faults of each evaluation."""
+    from companion.log_edit.faults import library
+    from companion.log_trial import LOG_SUFFIX, log_config
+    from companion.sim.scenario import load_scenario
+
+    if faults != ["library"]:
+        return [(path, faults) for path in paths]
+    runs = []
+    for path in paths:
+        is_log = path.suffix == LOG_SUFFIX
+        config = log_config(path, sets) if is_log else load_scenario(path, None, sets).config
+        runs += [(path, [text]) for text in library(config)]
+    return runs
+
+
+def _write_report(
+    results: "list[Evaluation]", path: Path, folder: Path, sets: list[str], faults: list[str]
+) -> list[str]:
+    """Picture, worst trial and Markdown of the newest result, after those before; says what is there."""
+    from companion.evaluation_plots import evaluation_figure
+    from companion.evaluation_table import markdown
+    from companion.worst_trial import write_worst_trial
+
+    newest = results[-1]
+    picture = folder / f"{newest.file_stem}.png"
+    evaluation_figure(newest, picture)
+    text = "\n".join(markdown(result, [f"{result.file_stem}.png"]) for result in results)
+    (folder / "report.md").write_text(text, encoding="utf-8")
+    lines = [f"report   {folder / 'report.md'}", f"picture  {picture}"]
+    log = write_worst_trial(newest, path, folder, sets, faults)
+    if log is not None:
+        lines.append(f"worst trial of {newest.decisive}, seed {newest.worst_seed()}: {log}")
+        lines.append(f"look at it: companion replay {log}, then rerun out/{log.stem}/replay.rrd")
+    return lines
 
 
 @app.command()
@@ -50,15 +239,7 @@ def functions(
         )
         contenders = [name for name in contenders if name not in RIVALS]
     count = trials * len(Setting) * len(contenders) * len(FUNCTIONS)
-    with Progress(
-        TextColumn("runs"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-        console=err,
-        transient=True,
-        disable=not err.is_terminal,
-    ) as progress:
+    with _progress(err) as progress:
         bar = progress.add_task("runs", total=count)
         race = run_race(contenders, trials, seed, os.cpu_count() or 1, lambda: progress.advance(bar))
     for setting in Setting:
@@ -69,6 +250,19 @@ def functions(
     out.print(verdict(race), soft_wrap=True)
     if figures is not None:
         figures.write_text(json.dumps(race.to_json(), indent=2) + "\n", encoding="utf-8")
+
+
+def _progress(err: Console) -> Progress:
+    """A bar on a terminal, with what is done and the time left."""
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+        console=err,
+        transient=True,
+        disable=not err.is_terminal,
+    )
 
 
 def _make_writable(*paths: Path) -> None:

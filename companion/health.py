@@ -97,10 +97,16 @@ class HealthMonitor:
         has_ranges: the site has a UWB sensor.
         has_scans: the site has a LiDAR.
         anchor_ids: of the site.
+        needs_heading: the autopilot takes the heading from us; a pose without one is no use to it.
     """
 
     def __init__(
-        self, table: HealthTable, has_ranges: bool, has_scans: bool, anchor_ids: Iterable[int] = ()
+        self,
+        table: HealthTable,
+        has_ranges: bool,
+        has_scans: bool,
+        anchor_ids: Iterable[int] = (),
+        needs_heading: bool = True,
     ) -> None:
         self._table = table
         self._anchor_ids = tuple(anchor_ids)
@@ -108,6 +114,7 @@ class HealthMonitor:
         self._used_ns: dict[int, int] = {}
         self._has_ranges = has_ranges
         self._has_scans = has_scans
+        self._used = 6 if needs_heading else 5
         self._resets = 0
         self._accepted_share: float
         self._short_share: float
@@ -118,6 +125,10 @@ class HealthMonitor:
         self._increment_ns: int | None = None
         self._begin_ns: int | None = None
         self._note = ""
+
+    def set_table(self, table: HealthTable) -> None:
+        """Judge by other limits from now on."""
+        self._table = table
 
     def observe(self, measurement: Measurement, report: Report) -> None:
         """Take note of what the estimator made of a measurement."""
@@ -202,24 +213,26 @@ class HealthMonitor:
         awaited = [s.what for s in sources if s.first_awaited and not s.is_stale]
         if awaited:
             return Health(State.STARTING, f"waiting for the first {awaited[0]}")
-        if np.isposinf(pose.cov[5, 5]):
+        cov = pose.cov[: self._used, : self._used]
+        if np.isposinf(pose.cov[5, 5]) and self._used == 6:
             return Health(State.LOST, f"heading not known: {self._note or 'start again on the start mark'}")
-        if not (np.isfinite(pose.T_map_body).all() and np.isfinite(pose.cov).all()):
+        if not (np.isfinite(pose.T_map_body).all() and np.isfinite(cov).all()):
             return Health(State.LOST, "pose or covariance is not finite")
-        if np.linalg.eigvalsh(pose.cov)[0] <= 0.0:
+        if np.linalg.eigvalsh(cov)[0] <= 0.0:
             return Health(State.LOST, "covariance is not positive definite")
         sigma_xy = float(np.sqrt(np.linalg.eigvalsh(pose.cov[:2, :2])[1]))
         if sigma_xy > table.max_sigma_xy:
             return Health(State.LOST, f"position sigma {sigma_xy:.2f} m above {table.max_sigma_xy:g} m")
         sigma_yaw = float(np.rad2deg(np.sqrt(pose.cov[5, 5])))
-        if sigma_yaw > table.max_sigma_yaw_deg:
+        if self._used == 6 and sigma_yaw > table.max_sigma_yaw_deg:
             return Health(
                 State.LOST, f"heading sigma {sigma_yaw:.0f} deg above {table.max_sigma_yaw_deg:g} deg"
             )
         if self._has_ranges and not self._agrees:
             return self._disagreement()
         stale = [f"no {s.what} accepted for {s.age:.1f} s" for s in sources if s.is_stale]
-        if len(stale) == len(sources):
+        dead_reckoned = self._has_ranges and sources[0].is_stale and sources[0].age > table.max_dead_reckoning
+        if len(stale) == len(sources) or dead_reckoned:
             return Health(State.LOST, "; ".join(stale))
         return Health(State.DEGRADED, stale[0]) if stale else Health(State.OK, "")
 

@@ -10,13 +10,17 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from companion.config import Config, MavlinkTable, SensorTable
+from companion.config import Config, SensorTable
 from companion.errors import UserError
 from companion.health import Health, uwb_line
 from companion.log import Direction, LogWriter, RawChunk
+from companion.mavlink.budget import budget_warning
+from companion.mavlink.contact import Watch
+from companion.mavlink.link import GROUND, wire_opener
 from companion.mavlink.link import NAME as MAVLINK
-from companion.mavlink.link import wire_opener
+from companion.mavlink.parameters import save_setting, setting_line
 from companion.mavlink.session import MavlinkSession
+from companion.mavlink.signing import SigningClock, read_key
 from companion.pipeline import Chain, Tick, make_pipeline
 from companion.range_log import HEADER, range_lines
 from companion.replay import tum_line
@@ -73,6 +77,7 @@ class LiveRun:
         config: of the site.
         folder: gets `raw.mcap`, `config.toml`, `poses.tum` and `ranges.csv`.
         say: takes one line for the operator when a port or the health changes.
+        watch: who else wants to hear the autopilot.
         view: where the run is shown while it runs.
 
     Raises:
@@ -80,15 +85,33 @@ class LiveRun:
             cannot be opened.
     """
 
-    def __init__(self, config: Config, folder: Path, say: Callable[[str], None], view: Shown = "off") -> None:
-        self._inbox = Inbox([*config.sensor, MAVLINK])
+    def __init__(
+        self,
+        config: Config,
+        folder: Path,
+        say: Callable[[str], None],
+        watch: Watch | None = None,
+        view: Shown = "off",
+    ) -> None:
+        self._inbox = Inbox([*config.sensor, MAVLINK, GROUND])
         self.status = LiveStatus(dropped=self._inbox.dropped)
         self._operator = say
         self._view: LiveView | None = None
         self._drops_said, self._drops_due_ns = 0, 0
         self._anchors_said = ""
         # First what may refuse its settings, so that a wrong call leaves no folder behind.
-        self._link = self._make_link(config.mavlink)
+        urls = {MAVLINK: config.mavlink.url, GROUND: config.mavlink.ground_url}
+        keys = {MAVLINK: "mavlink.url", GROUND: "mavlink.ground_url"}
+        self._links = {
+            name: Port(name, url, wire_opener(url, config.mavlink.baud, keys[name]), self._inbox.put)
+            for name, url in urls.items()
+            if url
+        }
+        self._parameter_file = config.mavlink.parameter_file
+        key_file = config.mavlink.signing_key
+        self._signing_clock = SigningClock(Path(key_file)) if key_file else None
+        key = read_key(Path(key_file)) if key_file else None
+        self._session = MavlinkSession(config, key, self._signing_clock, watch)
         start_ns = time.monotonic_ns()
         self._anchors_due_ns = start_ns + ANCHORS_PERIOD_NS
         if view != "off":
@@ -110,14 +133,15 @@ class LiveRun:
         self._chain = Chain(config, start_ns, pipeline, self._primary, watched=self._view is not None)
         self._ports = {name: self._make_port(name, table) for name, table in config.sensor.items()}
         self._open_sensors: set[str] = set()
-        self._session = MavlinkSession(config.mavlink, config.map_heading())
+        if warning := budget_warning(config):
+            say(warning)
 
     def run(self, stop: threading.Event) -> None:
         """Work until `stop` is set, then leave the devices quiet and close everything."""
         for port in self._ports.values():
             port.start()
-        if self._link is not None:
-            self._link.start()
+        for link in self._links.values():
+            link.start()
         try:
             while not stop.is_set():
                 self._wait_and_take()
@@ -126,9 +150,6 @@ class LiveRun:
                 self._say_drops()
         finally:
             self._close()
-
-    def _make_link(self, table: MavlinkTable) -> Port | None:
-        return Port(MAVLINK, table.url, wire_opener(table), self._inbox.put) if table.url else None
 
     def _make_port(self, name: str, table: SensorTable) -> Port:
         address = parse_address(table.port)
@@ -153,10 +174,12 @@ class LiveRun:
             return
         chunk = RawChunk(event.name, Direction.IN, event.stamp_ns, event.data)
         self._log.raw(chunk)
-        if event.name == MAVLINK:
+        if event.name in self._links:
             self._show(chunk)
-            self._session.receive(event.data)
+            self._session.receive(event.name, event.data, event.stamp_ns, time.monotonic_ns())
             self.status.autopilot = self._session.autopilot
+            self._take_over_parameters()
+            self._send_mavlink()
         self._work(self._chain.feed(chunk))
 
     def _set_open(self, status: PortStatus) -> None:
@@ -185,17 +208,42 @@ class LiveRun:
             )
         self.status.pose, self.status.health = pose, tick.health
         now_ns = time.monotonic_ns()
-        if now_ns - tick.stamp_ns > self._period_ns:
-            # The loop fell behind: an autopilot is better off with a gap than with a burst of old poses.
-            self.status.stale_ticks += 1
-            pose = None
+        # The loop fell behind: an autopilot is better off with a gap than with a burst of old poses.
+        is_late = now_ns - tick.stamp_ns > self._period_ns
+        self.status.stale_ticks += is_late
         packed = self._session.poses_packed
-        data = self._session.tick(pose, tick.health, now_ns)
-        if data and self._link is not None and self._link.write(data):
+        for outcome in tick.outcomes:
+            self._session.observe(outcome.measurement, outcome.reports[self._primary])
+        self._session.tick(pose, tick.health, now_ns, is_late)
+        if MAVLINK in self._send_mavlink():
             self.status.poses_sent += self._session.poses_packed - packed
-            chunk = RawChunk(MAVLINK, Direction.OUT, now_ns, data)
-            self._log.raw(chunk)
-            self._show(chunk)
+        if self._signing_clock is not None:
+            self._signing_clock.save(now_ns)
+
+    def _send_mavlink(self) -> set[str]:
+        """Write what the session has to say; gives the links that took it."""
+        sent = set()
+        for name, data in self._session.take().items():
+            if name in self._links and self._links[name].write(data):
+                chunk = RawChunk(name, Direction.OUT, time.monotonic_ns(), data)
+                self._log.raw(chunk)
+                self._show(chunk)
+                sent.add(name)
+        return sent
+
+    def _take_over_parameters(self) -> None:
+        """Use and keep what a ground station has set."""
+        for parameter, config in self._session.take_changes():
+            line = setting_line(parameter, config)
+            when = "" if parameter.applies_at_once else ", from the next start on"
+            self._say(f"{parameter.name} set by the ground station: {line}{when}")
+            if parameter.applies_at_once:
+                self._chain.set_health(config.health)
+            if self._parameter_file:
+                try:
+                    save_setting(Path(self._parameter_file), line)
+                except UserError as error:
+                    self._say(str(error))
 
     def _say(self, line: str) -> None:
         self._operator(line)
@@ -235,8 +283,8 @@ class LiveRun:
                 time.sleep(CLOSING_PAUSE)
         for port in self._ports.values():
             port.close()
-        if self._link is not None:
-            self._link.close()
+        for link in self._links.values():
+            link.close()
         self._poses.close()
         self._ranges.close()
         self._log.close()

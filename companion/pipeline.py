@@ -7,25 +7,38 @@ replay of the log asks for exactly the poses that the live run gave.
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Protocol
 
-from companion.config import Config
+from companion.config import Config, HealthTable
 from companion.health import AnchorState, Health, HealthMonitor
 from companion.log import Direction, RawChunk
+from companion.mavlink.link import NAME as MAVLINK
+from companion.mavlink.signing import read_key
 from companion.sequencer import Sequencer
 from drivers import make_sensor
+from drivers.autopilot import Autopilot
 from drivers.framing import Sensor
 from estimators import make_estimator
 from estimators.base import Estimator, Report, Sketch, Sketched
 from estimators.lidar.scan_matching import ScanMatcher
 from estimators.messages import Measurement, PoseEstimate, PoseIncrement, RangeFrame, Scan
+from estimators.models.range_bias import without_bias
 
 
 class FrontEnd(Protocol):
-    """Turns scans into motion."""
+    """Turns scans, or what else tells motion, into increments."""
 
-    def update(self, scan: Scan) -> PoseIncrement | None:
-        """Increment up to the end of the scan; None when the scan gives none."""
+    def update(self, measurement: Measurement) -> PoseIncrement | None:
+        """Increment up to the time of the measurement; None when it gives none."""
+        ...
+
+
+class Decoder(Protocol):
+    """Turns bytes into measurements."""
+
+    def feed(self, data: bytes, stamp_ns: int) -> list[Measurement]:
+        """Decode bytes that arrived at `stamp_ns`; never raises on any bytes."""
         ...
 
 
@@ -60,7 +73,7 @@ class Pipeline:
     """Front end and estimators side by side on the same measurements.
 
     Args:
-        front_end: scan matcher.
+        front_end: gives the increments.
         estimators: name -> estimator.
     """
 
@@ -71,10 +84,9 @@ class Pipeline:
     def step(self, measurement: Measurement) -> list[Outcome]:
         """Process one measurement; a scan also yields the outcome of its increment."""
         outcomes = [self._update(measurement)]
-        if isinstance(measurement, Scan):
-            increment = self._front_end.update(measurement)
-            if increment is not None:
-                outcomes.append(self._update(increment))
+        increment = self._front_end.update(measurement)
+        if increment is not None:
+            outcomes.append(self._update(increment))
         return outcomes
 
     def poses_at(self, stamp_ns: int) -> dict[str, PoseEstimate | None]:
@@ -107,12 +119,13 @@ class Chain:
         self, config: Config, start_ns: int, pipeline: Pipeline, primary: str, watched: bool = False
     ) -> None:
         self.sensors = make_sensors(config)
+        self._decoders: dict[str, Decoder] = {**self.sensors, **make_autopilot_input(config)}
         self.sequencer = Sequencer(round(config.pipeline.hold_ms * 1e6))
         self._pipeline = pipeline
         self._primary = primary
         self._watched = watched
-        measured = {kind for sensor in self.sensors.values() for kind in sensor.MEASURES}
-        self._monitor = HealthMonitor(config.health, RangeFrame in measured, Scan in measured, config.anchors)
+        self._monitor = make_monitor(config, self.sensors)
+        self._range_biases = config.range_biases()
         self._start_ns = start_ns
         self._period_ns = 1e9 / config.pipeline.rate
         self._ticks = 0
@@ -129,10 +142,17 @@ class Chain:
     def feed(self, chunk: RawChunk) -> Iterator[Tick]:
         """Give the ticks that were due before these bytes arrived, then decode the bytes."""
         yield from self.advance(chunk.stamp_ns)
-        sensor = self.sensors.get(chunk.source)
-        if sensor is not None and chunk.direction is Direction.IN:
-            for measurement in sensor.feed(chunk.data, chunk.stamp_ns):
+        decoder = self._decoders.get(chunk.source)
+        if decoder is not None and chunk.direction is Direction.IN:
+            for measurement in decoder.feed(chunk.data, chunk.stamp_ns):
+                # Here once, so that logs stay as measured and replay takes off what it is told to.
+                if isinstance(measurement, RangeFrame):
+                    measurement = without_bias(measurement, self._range_biases)
                 self.sequencer.push(measurement)
+
+    def set_health(self, table: HealthTable) -> None:
+        """Judge by other limits from now on; the poses do not change with them."""
+        self._monitor.set_table(table)
 
     def advance(self, now_ns: int) -> Iterator[Tick]:
         """Give every tick that is due at `now_ns`."""
@@ -156,13 +176,38 @@ def make_sensors(config: Config) -> dict[str, Sensor]:
     return {name: make_sensor(table.driver, table.settings) for name, table in config.sensor.items()}
 
 
+def make_autopilot_input(config: Config) -> dict[str, Decoder]:
+    """Decoder of what the autopilot measures, by the name of its link; none when nothing of it is used."""
+    inputs, key = config.mavlink.inputs, config.mavlink.signing_key
+    if not any((inputs.attitude, inputs.imu, inputs.height, inputs.odometry, inputs.wheels)):
+        return {}
+    return {MAVLINK: Autopilot(inputs, config.mavlink.autopilot_id, read_key(Path(key)) if key else None)}
+
+
+def make_monitor(config: Config, sensors: Mapping[str, Sensor]) -> HealthMonitor:
+    """What judges the poses of a run with the site's sensors."""
+    measured = {kind for sensor in sensors.values() for kind in sensor.MEASURES}
+    inputs = config.mavlink.inputs
+    return HealthMonitor(
+        config.health,
+        RangeFrame in measured,
+        Scan in measured or bool(inputs.odometry or inputs.wheels),
+        config.anchors,
+        config.mavlink.heading,
+    )
+
+
 def make_parts(config: Config, names: list[str]) -> tuple[FrontEnd, dict[str, Estimator]]:
     """Front end and the named estimators with the site's settings."""
     setup = config.setup()
-    front_end = ScanMatcher(config.scan_matcher, config.lidar_mounting())
-    return front_end, {
+    return make_front_end(config), {
         name: make_estimator(name, config.estimator_config(name), setup, config.relocation) for name in names
     }
+
+
+def make_front_end(config: Config) -> FrontEnd:
+    """What turns the site's scans into increments."""
+    return ScanMatcher(config.scan_matcher, config.lidar_mounting(), config.scan_preparation)
 
 
 def make_pipeline(config: Config, names: list[str]) -> Pipeline:

@@ -18,6 +18,8 @@ from estimators.messages import FloatArray
 # Okabe and Ito's colours: told apart by colour-blind eyes too.
 _PRIMARY, _TRUTH = "#0072B2", "#000000"
 _OTHERS = ("#CC79A7", "#E69F00", "#009E73", "#D55E00", "#56B4E9")
+PALETTE = (_PRIMARY, *_OTHERS)
+"""Colours of estimators, in the order in which they are named."""
 _WALL, _OBSTACLE, _INK, _GRID = "#404040", "#909090", "#303030", "#E4E4E4"
 _SIZE, _DPI = (10.0, 5.7), 150
 """Inches and dots an inch: 1500 x 855 pixels, with text that is still read at a width of 900."""

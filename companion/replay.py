@@ -6,6 +6,7 @@ from collections import Counter, defaultdict
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from statistics import fmean
 
 from scipy.spatial.transform import Rotation
 
@@ -70,10 +71,11 @@ class _TimedFrontEnd:
         self._front_end = front_end
         self._stopwatch = stopwatch
 
-    def update(self, scan: Scan) -> PoseIncrement | None:
+    def update(self, measurement: Measurement) -> PoseIncrement | None:
         begin = time.perf_counter()
-        increment = self._front_end.update(scan)
-        self._stopwatch.note(begin)
+        increment = self._front_end.update(measurement)
+        if isinstance(measurement, Scan):
+            self._stopwatch.note(begin)
         return increment
 
 
@@ -90,6 +92,7 @@ class Replay:
         verdicts: estimator -> how often each verdict was given to a range or increment.
         anchor_verdicts: estimator -> anchor -> the same of its ranges.
         range_lines: lines of `ranges.csv`, of the primary.
+        iterations: estimator -> steps of its solver for each frame; empty without such a solver.
         health: state -> number of ticks.
         sensors: sensor -> what its decoder counted.
         late: measurements that came too late to be used.
@@ -105,6 +108,7 @@ class Replay:
     verdicts: dict[str, Counter[str]] = field(default_factory=dict)
     anchor_verdicts: dict[str, dict[int, Counter[str]]] = field(default_factory=dict)
     range_lines: list[str] = field(default_factory=list)
+    iterations: dict[str, list[int]] = field(default_factory=dict)
     health: Counter[str] = field(default_factory=Counter)
     sensors: dict[str, DecodeStats] = field(default_factory=dict)
     late: int = 0
@@ -154,6 +158,7 @@ def replay(
     result.update_times = {name: Stopwatch() for name in ["scan_matcher", *names]}
     result.verdicts = {name: Counter() for name in names}
     result.anchor_verdicts = {name: defaultdict(Counter) for name in names}
+    result.iterations = {name: [] for name in names}
     pipeline = _timed_pipeline(config, names, result.update_times)
     chain = Chain(config, begin_ns, pipeline, names[0], watched=on_chunk is not None)
     truths: list[Truth] = []
@@ -172,6 +177,8 @@ def replay(
                 for name, report in outcome.reports.items():
                     for anchor_id, verdict in zip(frame.anchor_ids.tolist(), report.verdicts, strict=True):
                         result.anchor_verdicts[name][anchor_id][verdict] += 1
+                    if report.iterations is not None:
+                        result.iterations[name].append(report.iterations)
         for name, pose in tick.poses.items():
             if pose is not None:
                 result.poses[name].append(pose)
@@ -244,6 +251,7 @@ def summary(result: Replay) -> dict[str, object]:
             "update_ms": result.update_times[name].mean_ms,
             "verdicts": dict(result.verdicts[name]),
             "anchors": {str(i): dict(counts) for i, counts in sorted(result.anchor_verdicts[name].items())},
+            "solver_iterations": fmean(taken) if (taken := result.iterations[name]) else None,
         }
         for name in result.names
     }

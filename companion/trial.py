@@ -1,27 +1,40 @@
 """One trial of a scenario: estimators side by side on the same measurements, and how far each was off."""
 
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from companion.alignment import Alignment
+from companion.config import Config
 from companion.estimator_choice import chosen_settings, split_choice
 from companion.evaluate import Errors, Reference, compare
+from companion.legs import LegFigures, leg_figures
 from companion.log import Truth
-from companion.pipeline import Chain, Outcome, Pipeline
+from companion.metrics import integrity_violations, relative_errors, trajectory_error
+from companion.pipeline import Chain, Outcome, Pipeline, make_front_end, make_monitor, make_sensors
 from companion.range_score import RangeScore, TrueExcess
 from companion.sim.measurements import MeasuredWalk, measure, setup_of
 from companion.sim.scenario import Scenario, load_scenario
 from companion.sim.simulate import START_NS, converse
+from companion.watched import WatchedEstimator
 from estimators import make_estimator
-from estimators.base import Estimator, Report, Setup, Verdict
-from estimators.bounds import landmark_information, posterior_bound, range_information
+from estimators.base import Estimator, Setup
+from estimators.bounds import (
+    landmark_information,
+    position_information,
+    posterior_bound,
+    range_information,
+)
+from estimators.geometry import transform_each
 from estimators.lidar.dead_reckoning import DeadReckoning
-from estimators.lidar.scan_matching import ScanMatcher
-from estimators.messages import Measurement, PoseEstimate, RangeFrame
+from estimators.messages import FloatArray, PoseEstimate, RangeFrame
 
+_BOUND_POSES = 300
+"""The bound of single frames is taken at about so many poses of the walk."""
+_WORST_CONDITION = 1e4
+"""Of information that still tells a position."""
 UWB_ALONE, LIDAR_ALONE = "uwb_ls", "lidar"
 """The single sensors: `least_squares` on ranges alone; increments added up from the true start."""
 
@@ -46,8 +59,22 @@ class TrialFigures:
         update_us: median and 99th percentile of the time of an update that was used [us].
         bound_ratio: `rmse_m` over the posterior Cramer-Rao bound; None when that is not known.
         settled_s: time from the first motion, or from the last kidnapping, until the pose stays within
-            `RIGHT_WITHIN` to the end [s]; infinite when it does not, or has no heading.
-        ranges: what became of blocked and of clean ranges.
+            `RIGHT_WITHIN` to the end [s]; infinite when it does not, or has no heading; None when the start
+            was known.
+        ranges: what became of blocked and of clean ranges; None when nobody knows which are which.
+        ate_m: `rmse_m` after the alignment that was asked for.
+        rpe_m: root mean square of the position error that grows over a metre of the way; None without
+            heading, or on a shorter way.
+        rpe_deg: the same of the heading.
+        nis: mean NIS of the ranges that were accepted; None when there are none.
+        nis_count: how many they are.
+        first_fix_s: time from the first instant to the first pose that a live run would send; None without.
+        integrity: share of the poses that would be sent whose error is beyond 3 sigma; None without any.
+        epoch_bound_ratio: `rmse_m` over what a single frame of unblocked ranges allows; below 1 for what has
+            a memory or a LiDAR; None when not known.
+        errors: at every instant.
+        iterations: mean steps of its solver for a frame; None without such a solver.
+        legs: the same errors on the legs that the scenario names.
     """
 
     rmse_m: float
@@ -63,12 +90,23 @@ class TrialFigures:
     availability: float
     update_us: tuple[float, float]
     bound_ratio: float | None
-    settled_s: float
-    ranges: RangeScore
+    settled_s: float | None
+    ranges: RangeScore | None
+    ate_m: float
+    rpe_m: float | None
+    rpe_deg: float | None
+    nis: float | None
+    nis_count: int
+    first_fix_s: float | None
+    integrity: float | None
+    epoch_bound_ratio: float | None
+    errors: Errors
+    iterations: float | None
+    legs: dict[str, LegFigures]
 
 
 def run_trial(
-    path: Path, seed: int, sets: list[str], choices: Sequence[str]
+    path: Path, seed: int, sets: list[str], choices: Sequence[str], alignment: Alignment = Alignment.NONE
 ) -> dict[str, TrialFigures | None]:
     """Run a scenario once.
 
@@ -77,6 +115,7 @@ def run_trial(
         seed: of everything random.
         sets: `--set` assignments on the site's configuration.
         choices: NAME[:PARAM] of estimators, or single sensors.
+        alignment: of tracks, for `TrialFigures.ate_m`.
 
     Returns:
         Figures by choice; None for an estimator that gave no pose at all.
@@ -86,7 +125,14 @@ def run_trial(
     """
     scenario = load_scenario(path, seed, sets)
     setup = setup_of(scenario)
-    timed = {choice: _TimedEstimator(_make(scenario, setup, choice)) for choice in choices}
+    start = scenario.trajectory.at(np.zeros(1)).pose[0]
+    watched = {
+        choice: WatchedEstimator(
+            make_choice(scenario.config, setup, choice, start),
+            make_monitor(scenario.config, make_sensors(scenario.config)),
+        )
+        for choice in choices
+    }
     poses: dict[str, list[PoseEstimate]] = {choice: [] for choice in choices}
     bound: float | None = None
     excess = TrueExcess(1.0 / scenario.file.uwb.rate)
@@ -95,54 +141,49 @@ def run_trial(
         bound = _bound(scenario, setup, walk)
         for frame, by_anchor in zip(walk.range_frames, walk.excess, strict=True):
             excess.note(frame.stamp_ns, by_anchor)
-        truths, instants, outcomes = _step_through(walk, timed, poses)
+        truths, instants, outcomes = _step_through(walk, watched, poses)
     else:
-        truths, instants, outcomes = _run_chain(scenario, timed, poses, excess)
+        truths, instants, outcomes = _run_chain(scenario, watched, poses, excess)
     scores = _scores(choices, outcomes, excess, scenario.file.uwb.sigma)
     reference = Reference(truths)
     covered = sum(reference.covers(stamp_ns) for stamp_ns in instants)
-    sought_ns = _sought_since(truths, kidnapped=bool(scenario.file.kidnap))
-    return {
-        choice: _figures(
-            compare(poses[choice], reference, covered),
-            timed[choice].seconds,
-            bound,
-            sought_ns,
-            scores[choice],
+    epoch_bound = _epoch_bound(scenario, setup, np.array([truth.pose for truth in truths]))
+    sought_ns = _sought_since(scenario, truths)
+    found: dict[str, TrialFigures | None] = {}
+    for choice in choices:
+        errors = compare(poses[choice], reference, covered)
+        found[choice] = trial_figures(
+            errors,
+            watched[choice],
+            instants[0],
+            alignment,
+            bound=bound,
+            epoch_bound=epoch_bound,
+            sought_ns=sought_ns,
+            ranges=scores[choice],
+            legs=leg_figures(scenario, errors),
         )
-        for choice in choices
-    }
+    return found
 
 
-class _TimedEstimator:
-    """An estimator that notes how long each update took that it had a use for."""
+def make_choice(config: Config, setup: Setup, choice: str, start: FloatArray) -> Estimator:
+    """Estimator or single sensor that a choice names.
 
-    def __init__(self, estimator: Estimator) -> None:
-        self._estimator = estimator
-        self.seconds: list[float] = []
+    Args:
+        config: of the site.
+        setup: its geometry.
+        choice: NAME[:PARAM].
+        start: (3,) true x [m], y [m], yaw [rad] at the start, from which `lidar` counts.
 
-    def reset(self) -> None:
-        self._estimator.reset()
-
-    def update(self, measurement: Measurement) -> Report:
-        begin = time.perf_counter()
-        report = self._estimator.update(measurement)
-        took = time.perf_counter() - begin
-        if Verdict.NOT_USED not in report.verdicts:
-            self.seconds.append(took)
-        return report
-
-    def pose_at(self, stamp_ns: int) -> PoseEstimate | None:
-        return self._estimator.pose_at(stamp_ns)
-
-
-def _make(scenario: Scenario, setup: Setup, choice: str) -> Estimator:
+    Raises:
+        UserError: the parameter is wrong.
+    """
     if choice == LIDAR_ALONE:
-        return DeadReckoning(setup, scenario.trajectory.at(np.zeros(1)).pose[0])
+        return DeadReckoning(setup, start)
     if choice == UWB_ALONE:
         choice = "least_squares"
-    settings = chosen_settings(scenario.config, choice, "--estimators")
-    return make_estimator(split_choice(choice)[0], settings, setup, scenario.config.relocation)
+    settings = chosen_settings(config, choice, "--estimators")
+    return make_estimator(split_choice(choice)[0], settings, setup, config.relocation)
 
 
 def _step_through(
@@ -171,8 +212,7 @@ def _run_chain(
 ) -> tuple[list[Truth], list[int], list[Outcome]]:
     """The whole chain from emulated bytes on, in memory; poses at its ticks."""
     config = scenario.config
-    front_end = ScanMatcher(config.scan_matcher, config.lidar_mounting())
-    chain = Chain(config, START_NS, Pipeline(front_end, estimators), next(iter(estimators)))
+    chain = Chain(config, START_NS, Pipeline(make_front_end(config), estimators), next(iter(estimators)))
     truths: list[Truth] = []
     instants: list[int] = []
     outcomes: list[Outcome] = []
@@ -233,11 +273,34 @@ def _bound(scenario: Scenario, setup: Setup, walk: MeasuredWalk) -> float | None
     return float(np.sqrt((bounds[:, 0, 0] + bounds[:, 1, 1]).mean()))
 
 
-def _sought_since(truths: Sequence[Truth], kidnapped: bool) -> int:
-    """When the robot set off, or was carried off for the last time."""
+def _epoch_bound(scenario: Scenario, setup: Setup, poses: FloatArray) -> float | None:
+    """Root mean square over the walk of the least error of one frame of ranges [m].
+
+    Blocked ranges do not count. Poses from which ranges give no position are left out; None when there is
+    no other, or without noise.
+    """
+    sigma = scenario.file.uwb.sigma
+    if sigma == 0.0:
+        return None
+    some = poses[:: max(1, len(poses) // _BOUND_POSES)]
+    horizontal = transform_each(some, setup.tag_in_body[None, :2])
+    tags = np.column_stack([horizontal, np.full(len(some), setup.height + setup.tag_in_body[2])])
+    anchors = np.array(list(setup.anchors.values()))
+    clear = np.array([scenario.world.line_of_sight(tag, anchors) for tag in tags])
+    information = position_information(tags, anchors, clear, sigma)
+    told = np.linalg.cond(information) < _WORST_CONDITION
+    if not told.any():
+        return None
+    return float(np.sqrt(np.linalg.inv(information[told]).trace(axis1=1, axis2=2).mean()))
+
+
+def _sought_since(scenario: Scenario, truths: Sequence[Truth]) -> int | None:
+    """When the robot set off, or was carried off for the last time; None when its place was known."""
     xy = np.array([truth.pose[:2] for truth in truths])
-    if kidnapped:
+    if scenario.file.kidnap:
         return truths[1 + int(np.argmax(np.linalg.norm(np.diff(xy, axis=0), axis=1)))].stamp_ns
+    if scenario.config.start.known:
+        return None
     return truths[int(np.argmax(np.linalg.norm(xy - xy[0], axis=1) > MOVED))].stamp_ns
 
 
@@ -251,16 +314,41 @@ def _settled(errors: Errors, since_ns: int) -> float:
     return max(0.0, float(errors.stamps_ns[right_from] - since_ns) * 1e-9)
 
 
-def _figures(
-    errors: Errors, seconds: list[float], bound: float | None, sought_ns: int, ranges: RangeScore
+def trial_figures(
+    errors: Errors,
+    watched: WatchedEstimator,
+    begin_ns: int,
+    alignment: Alignment,
+    *,
+    bound: float | None = None,
+    epoch_bound: float | None = None,
+    sought_ns: int | None = None,
+    ranges: RangeScore | None = None,
+    legs: dict[str, LegFigures] | None = None,
 ) -> TrialFigures | None:
+    """Figures of one estimator in one trial; None when it gave no pose where truth is known.
+
+    Args:
+        errors: of its poses.
+        watched: the estimator, after the trial.
+        begin_ns: first instant at which a pose was asked for.
+        alignment: of the track, for `TrialFigures.ate_m`.
+        bound: least position error that any estimator can have, root mean square [m]; None when not known.
+        epoch_bound: as `bound`, for estimators of a single frame of ranges [m].
+        sought_ns: from when on the pose had to be found; None when it was known.
+        ranges: what became of blocked and clean ranges; None when nobody knows which are which.
+        legs: figures of the legs that have names.
+    """
     accuracy = errors.accuracy()
     if accuracy is None:
         return None
     by_axis = np.abs(errors.error[:, :2])
     rmse_x, rmse_y = np.sqrt((by_axis**2).mean(axis=0)).tolist()
     max_x, max_y = by_axis.max(axis=0).tolist()
-    median, p99 = (1e6 * np.percentile(seconds, [50, 99])).tolist()
+    median, p99 = (1e6 * np.percentile(watched.seconds, [50, 99])).tolist()
+    drift = relative_errors(errors) if errors.has_yaw else np.empty((0, 3))
+    rpe = np.sqrt((drift**2).mean(axis=0)).tolist() if len(drift) else None
+    healthy_ns = watched.healthy_ns
     return TrialFigures(
         rmse_m=accuracy.rmse,
         rmse_x_m=rmse_x,
@@ -275,6 +363,17 @@ def _figures(
         availability=accuracy.availability,
         update_us=(median, p99),
         bound_ratio=accuracy.rmse / bound if bound is not None else None,
-        settled_s=_settled(errors, sought_ns),
+        settled_s=_settled(errors, sought_ns) if sought_ns is not None else None,
         ranges=ranges,
+        ate_m=trajectory_error(errors, alignment),
+        rpe_m=float(np.hypot(rpe[0], rpe[1])) if rpe else None,
+        rpe_deg=float(np.rad2deg(rpe[2])) if rpe else None,
+        nis=float(np.mean(watched.nis)) if watched.nis else None,
+        nis_count=len(watched.nis),
+        first_fix_s=(healthy_ns[0] - begin_ns) * 1e-9 if healthy_ns else None,
+        integrity=integrity_violations(errors, healthy_ns),
+        epoch_bound_ratio=accuracy.rmse / epoch_bound if epoch_bound else None,
+        errors=errors,
+        iterations=float(np.mean(watched.iterations)) if watched.iterations else None,
+        legs=legs or {},
     )

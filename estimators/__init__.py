@@ -9,13 +9,19 @@ from estimators.base import Estimator, Settable, Setup
 
 ESTIMATORS: dict[str, tuple[str, str]] = {
     "ekf": ("estimators.ekf", "Ekf"),
+    "gd": ("estimators.uwb.gradient_descent", "GradientDescent"),
+    "gd_pf": ("estimators.uwb.gd_pf", "GdPf"),
     "graph": ("estimators.graph.smoother", "GraphSmoother"),
     "least_squares": ("estimators.least_squares", "LeastSquares"),
     "lidar_odometry": ("estimators.lidar.odometry", "LidarOdometry"),
+    "linear_ls": ("estimators.uwb.gradient_descent", "LinearLeastSquares"),
+    "momentum_gd": ("estimators.uwb.gradient_descent", "MomentumGradientDescent"),
     "pf": ("estimators.particle_filter", "ParticleFilter"),
     "pf_ibas": ("estimators.pf_ibas", "PfIbas"),
     "pf_ibas_graph": ("estimators.graph.pf_ibas_graph", "PfIbasGraph"),
     "pf_ibas_printed": ("estimators.pf_ibas", "PrintedPfIbas"),
+    "uwb_imu_adaptive_ekf": ("estimators.uwb.uwb_imu_ekf", "UwbImuAdaptiveEkf"),
+    "uwb_imu_ekf": ("estimators.uwb.uwb_imu_ekf", "UwbImuEkf"),
 }
 """Name on the command line -> module and class. The class has a nested pydantic `Config`."""
 

@@ -69,12 +69,14 @@ class Report:
         residuals: like `verdicts`; measured minus predicted [m] for ranges, NaN where there is none.
         nis: like `verdicts`; normalised innovation squared, NaN where there is none.
         note: what the estimator lacks for a pose, for the operator; empty when it has one.
+        iterations: steps of an iterative solver; None where none was at work.
     """
 
     verdicts: tuple[Verdict, ...]
     residuals: FloatArray = field(default_factory=lambda: _EMPTY)
     nis: FloatArray = field(default_factory=lambda: _EMPTY)
     note: str = ""
+    iterations: int | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

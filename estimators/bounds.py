@@ -4,6 +4,7 @@ from collections.abc import Iterable, Sequence
 from math import hypot
 
 import numpy as np
+from numpy.typing import NDArray
 
 from estimators.base import Setup
 from estimators.messages import FloatArray
@@ -63,6 +64,29 @@ def range_information(pose: FloatArray, setup: Setup, anchor_ids: Iterable[int],
         horizontal, by_pose = horizontal_range(pose, anchor, setup.tag_in_body)
         slant_by_pose = by_pose * (horizontal / hypot(horizontal, setup.height_to(anchor)))
         information += np.outer(slant_by_pose, slant_by_pose) / sigma**2
+    return information
+
+
+def position_information(
+    points: FloatArray, anchors: FloatArray, counts: NDArray[np.bool_], sigma: float
+) -> FloatArray:
+    """Fisher information of one slant range to each anchor on the horizontal position of the tag.
+
+    Its inverse is the bound of a single epoch: what ranges alone can tell without any memory.
+
+    Args:
+        points: (N, 3) of the tag [m], map frame.
+        anchors: (M, 3) [m], map frame.
+        counts: (N, M) whether a range counts; a blocked one has an excess of unknown law, leave it out.
+        sigma: standard deviation of a range [m].
+
+    Returns:
+        (N, 2, 2) on (x, y).
+    """
+    offsets = points[:, None, :] - anchors
+    towards = offsets[..., :2] / np.linalg.norm(offsets, axis=2, keepdims=True)
+    towards = np.where(counts[..., None], towards, 0.0) / sigma
+    information: FloatArray = np.einsum("nmi,nmj->nij", towards, towards)
     return information
 
 

@@ -18,8 +18,15 @@ class Ekf(LidarOdometry):
     Every range corrects the state on its own, through the lever arm and after height reduction, when
     `RangeGate` lets it pass. The state is that of `LidarOdometry`.
 
-    Source: chen2019 Eq. (5)-(20); the paper's state and Jacobians are lost, those here are ours and
-    are tested against finite differences.
+    Where it follows chen2019, and where not. The paper measures ranges (3)-(4), and displacement and rotation
+    since the scan before (7)-(8), and corrects a linear prediction (5) with all of them (15)-(20): so it is
+    here. Its state (6) and Jacobians (12)-(14) are lost in the text; those here are ours and are tested
+    against finite differences. Instead of the length of the displacement we take it as a vector in the body
+    frame of a keyframe, because the direction is there for nothing; the keyframe's pose is part of the state,
+    and the velocity too. A gate on every range is not in the paper. Its time bias r_D (1)-(2) is taken off
+    before: `companion calibrate ranges`.
+
+    Source: chen2019 Eq. (3)-(20).
     """
 
     class Config(LandmarkGate.Config, RangeGate.Config, LidarOdometry.Config):

@@ -91,6 +91,21 @@ class Attitude:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Height:
+    """Distance to the ground below a sensor that looks down.
+
+    Attributes:
+        stamp_ns: measurement time.
+        height: [m], along the sensor's axis.
+        sigma: its standard deviation [m].
+    """
+
+    stamp_ns: int
+    height: float
+    sigma: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class PoseIncrement:
     """Planar motion of the body between two instants, as odometry gives it.
 
@@ -148,12 +163,16 @@ class PoseEstimate:
         cov: (6, 6) float64, covariance of (x, y, z, roll, pitch, yaw): position along the map axes,
             angles of the ZYX (yaw, pitch, roll) sequence. Infinite variance means "not known".
         reset_counter: grows by one with every discontinuity of the estimate.
+        velocity: (3,) float64 [m/s], along the map axes; None where the estimator keeps none.
+        velocity_cov: (3, 3) float64, covariance of `velocity`; None as that.
     """
 
     stamp_ns: int
     T_map_body: FloatArray
     cov: FloatArray
     reset_counter: int
+    velocity: FloatArray | None = None
+    velocity_cov: FloatArray | None = None
 
     @property
     def xy(self) -> FloatArray:
@@ -171,7 +190,7 @@ class PoseEstimate:
         return self.cov[PLANAR]
 
 
-Measurement: TypeAlias = RangeFrame | Scan | ImuSample | Attitude | PoseIncrement | LandmarkFrame
+Measurement: TypeAlias = RangeFrame | Scan | ImuSample | Attitude | Height | PoseIncrement | LandmarkFrame
 
 
 def measurement_stamp_ns(measurement: Measurement) -> int:

@@ -3,9 +3,10 @@
 from dataclasses import dataclass
 
 import numpy as np
-from pymavlink.dialects.v20 import common as mavlink2
+from pymavlink.dialects.v20 import all as mavlink2
 
 from companion.log import Direction, RawChunk
+from drivers.mavlink_frames import MavlinkMessage, MavlinkParser
 from estimators.messages import FloatArray
 
 MAX_LATENCY = 1.0
@@ -45,16 +46,14 @@ class LinkListener:
     def __init__(self, map_heading: float) -> None:
         c, s = np.cos(map_heading), np.sin(map_heading)
         self._R_map_ne = np.array([[c, s], [s, -c]])
-        self._parsers = {direction: mavlink2.MAVLink(None) for direction in Direction}
-        for parser in self._parsers.values():
-            parser.robust_parsing = True
+        self._parsers = {direction: MavlinkParser() for direction in Direction}
         self._texts: dict[tuple[int, int], str] = {}
         self._heartbeat_ns: int | None = None
 
     def listen(self, chunk: RawChunk) -> list[Heard]:
         """What these bytes complete."""
         said = []
-        for message in self._parsers[chunk.direction].parse_buffer(chunk.data) or []:
+        for message in self._parsers[chunk.direction].feed(chunk.data):
             if chunk.direction is Direction.OUT:
                 heard = self._sent(message, chunk.stamp_ns)
             else:
@@ -63,13 +62,18 @@ class LinkListener:
                 said.append(heard)
         return said
 
-    def _sent(self, message: mavlink2.MAVLink_message, stamp_ns: int) -> Heard | None:
-        if message.get_type() != "VISION_POSITION_ESTIMATE":
-            return None
-        latency = (stamp_ns - message.usec * 1000) * 1e-9
+    def _sent(self, message: MavlinkMessage, stamp_ns: int) -> Heard | None:
+        match message.get_type():
+            case "VISION_POSITION_ESTIMATE":
+                usec = message.usec
+            case "ODOMETRY":
+                usec = message.time_usec
+            case _:
+                return None
+        latency = (stamp_ns - usec * 1000) * 1e-9
         return Heard(stamp_ns, latency=latency) if 0.0 <= latency < MAX_LATENCY else None
 
-    def _received(self, message: mavlink2.MAVLink_message, stamp_ns: int) -> Heard | None:
+    def _received(self, message: MavlinkMessage, stamp_ns: int) -> Heard | None:
         match message.get_type():
             case "STATUSTEXT":
                 return self._text(message, stamp_ns)
@@ -85,7 +89,7 @@ class LinkListener:
                     return Heard(stamp_ns, text=f"autopilot back after {silent:.1f} s", is_urgent=True)
         return None
 
-    def _text(self, message: mavlink2.MAVLink_message, stamp_ns: int) -> Heard | None:
+    def _text(self, message: MavlinkMessage, stamp_ns: int) -> Heard | None:
         """A text; long ones come in pieces that bear one number."""
         key = message.get_srcSystem(), message.id
         text = (self._texts.pop(key, "") if message.id else "") + message.text

@@ -1,14 +1,12 @@
-"""A pose in the map as the autopilot wants it: NED, FRD, VISION_POSITION_ESTIMATE with covariance."""
+"""A pose in the map as the autopilot wants it: north, east, down; forward, right, down."""
 
 from dataclasses import dataclass
 
 import numpy as np
-from pymavlink.dialects.v20 import common as mavlink2
+from scipy.spatial.transform import Rotation
 
 from estimators.geometry import wrap_angle
 from estimators.messages import FloatArray, PoseEstimate
-
-_UPPER = np.triu_indices(6)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -19,11 +17,20 @@ class NedPose:
         position: (3,) [m].
         roll_pitch_yaw: (3,) [rad], ZYX sequence.
         cov: (6, 6), of position and the three angles.
+        velocity: (3,) [m/s], or None.
+        velocity_cov: (3, 3), or None.
     """
 
     position: FloatArray
     roll_pitch_yaw: FloatArray
     cov: FloatArray
+    velocity: FloatArray | None = None
+    velocity_cov: FloatArray | None = None
+
+    @property
+    def rotation(self) -> FloatArray:
+        """Rotation (3, 3) of the body, forward-right-down, in north-east-down."""
+        return Rotation.from_euler("ZYX", self.roll_pitch_yaw[::-1]).as_matrix()
 
 
 def to_ned(estimate: PoseEstimate, map_heading: float) -> NedPose:
@@ -39,8 +46,7 @@ def to_ned(estimate: PoseEstimate, map_heading: float) -> NedPose:
 
     Source: README, frame table.
     """
-    c, s = np.cos(map_heading), np.sin(map_heading)
-    R_ned_map = np.array([[c, s, 0.0], [s, -c, 0.0], [0.0, 0.0, -1.0]])
+    R_ned_map = ned_from_map(map_heading)
     R = estimate.T_map_body[:3, :3]
     roll = np.arctan2(R[2, 1], R[2, 2])
     pitch = np.arcsin(np.clip(-R[2, 0], -1.0, 1.0))
@@ -52,38 +58,14 @@ def to_ned(estimate: PoseEstimate, map_heading: float) -> NedPose:
         position=R_ned_map @ estimate.T_map_body[:3, 3],
         roll_pitch_yaw=np.array([roll, -pitch, yaw]),
         cov=jacobian @ estimate.cov @ jacobian.T,
+        velocity=None if estimate.velocity is None else R_ned_map @ estimate.velocity,
+        velocity_cov=(
+            None if estimate.velocity_cov is None else R_ned_map @ estimate.velocity_cov @ R_ned_map.T
+        ),
     )
 
 
-def vision_position_estimate(
-    estimate: PoseEstimate, map_heading: float
-) -> mavlink2.MAVLink_vision_position_estimate_message | None:
-    """The message, or None for a pose that holds anything not finite: no NaN leaves as a pose.
-
-    `usec` is the time for which the pose holds, on the host's monotonic clock.
-
-    Args:
-        estimate: pose in the map.
-        map_heading: compass heading of the map's x axis [rad].
-    """
-    if not (np.isfinite(estimate.T_map_body).all() and np.isfinite(estimate.cov).all()):
-        return None
-    ned = to_ned(estimate, map_heading)
-    return mavlink2.MAVLink_vision_position_estimate_message(
-        estimate.stamp_ns // 1000,
-        *ned.position.tolist(),
-        *ned.roll_pitch_yaw.tolist(),
-        covariance=ned.cov[_UPPER].tolist(),
-        reset_counter=estimate.reset_counter % 256,
-    )
-
-
-def ned_pose(message: mavlink2.MAVLink_vision_position_estimate_message) -> NedPose:
-    """The pose that a VISION_POSITION_ESTIMATE carries, as the autopilot reads it."""
-    cov: FloatArray = np.zeros((6, 6))
-    cov[_UPPER] = message.covariance
-    return NedPose(
-        np.array([message.x, message.y, message.z]),
-        np.array([message.roll, message.pitch, message.yaw]),
-        cov + np.triu(cov, 1).T,
-    )
+def ned_from_map(map_heading: float) -> FloatArray:
+    """`R_ned_map`, (3, 3), of a map whose x axis has this compass heading [rad]."""
+    c, s = np.cos(map_heading), np.sin(map_heading)
+    return np.array([[c, s, 0.0], [s, -c, 0.0], [0.0, 0.0, -1.0]])

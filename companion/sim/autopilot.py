@@ -1,8 +1,11 @@
 """An autopilot that listens: HEARTBEAT out, everything we send parsed by pymavlink's own parser."""
 
-from pymavlink.dialects.v20 import common as mavlink2
+import numpy as np
+from pymavlink.dialects.v20 import all as mavlink2
 
-from companion.mavlink.pose_out import NedPose, ned_pose
+from companion.mavlink.pose_out import NedPose
+from companion.mavlink.profiles import UPPER
+from estimators.messages import FloatArray
 
 SYSTEM_ID = 7
 """Not 1, so that taking over the autopilot's system id shows."""
@@ -46,3 +49,14 @@ class EmulatedAutopilot:
                     message.type == mavlink2.MAV_TYPE_ONBOARD_CONTROLLER
                     and message.autopilot == mavlink2.MAV_AUTOPILOT_INVALID
                 )
+
+
+def ned_pose(message: mavlink2.MAVLink_vision_position_estimate_message) -> NedPose:
+    """The pose that a VISION_POSITION_ESTIMATE carries, as the autopilot reads it."""
+    cov: FloatArray = np.zeros((6, 6))
+    cov[UPPER] = message.covariance
+    return NedPose(
+        np.array([message.x, message.y, message.z]),
+        np.array([message.roll, message.pitch, message.yaw]),
+        cov + np.triu(cov, 1).T,
+    )

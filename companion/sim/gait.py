@@ -31,6 +31,8 @@ class GaitTrajectory:
         """(3,) pose where the robot should stand at the start, map frame."""
         self.duration = straight.duration
         """Time from the first rest to the end of the last [s]."""
+        self.legs = straight.legs
+        """Begin and end of every leg [s]."""
 
     def at(self, times: FloatArray) -> Motion:
         """Motion at times (N,) [s] since the start; before and after it the robot stands still."""

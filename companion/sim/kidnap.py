@@ -22,6 +22,11 @@ class Walk(Protocol):
     duration: float
     """[s]."""
 
+    @property
+    def legs(self) -> list[tuple[float, float]]:
+        """Begin and end of every straight leg [s]."""
+        ...
+
     def at(self, times: FloatArray) -> Motion:
         """Motion at times (N,) [s] since the start."""
         ...
@@ -44,6 +49,7 @@ class Kidnapped:
         self._at = table.at
         self.start = walk.start
         self.duration = walk.duration
+        self.legs = walk.legs
         taken = walk.at(np.array([table.at])).pose[0]
         self._T_new_old = np.zeros(3)
         if table.to is not None:

@@ -8,13 +8,23 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from companion.sim.inertial import draw_inertial
 from companion.sim.ranging import draw_delay_biases, draw_ranging
 from companion.sim.scenario import Scenario
 from companion.sim.scenario_tables import IncrementsTable, KidnapTable, LandmarksTable
 from companion.sim.simulate import START_NS
 from estimators.base import Setup
 from estimators.geometry import between, rotation, transform_each, wrap_angle, wrap_angles
-from estimators.messages import FloatArray, IntArray, LandmarkFrame, PoseIncrement, RangeFrame
+from estimators.messages import (
+    Attitude,
+    FloatArray,
+    ImuSample,
+    IntArray,
+    LandmarkFrame,
+    Measurement,
+    PoseIncrement,
+    RangeFrame,
+)
 
 TAG_ID = 1
 
@@ -32,6 +42,7 @@ class MeasuredWalk:
         excess: for every range frame by how much what stands between makes the range of each anchor too long
             [m].
         landmark_frames: in stamp order.
+        inertial: attitudes, each before the sample of its instant.
     """
 
     stamps_ns: IntArray
@@ -41,10 +52,11 @@ class MeasuredWalk:
     unblocked: list[list[int]]
     excess: list[dict[int, float]]
     landmark_frames: list[LandmarkFrame]
+    inertial: list[ImuSample | Attitude]
 
-    def in_order(self) -> list[PoseIncrement | RangeFrame | LandmarkFrame]:
-        """All measurements in stamp order; of one instant the increment first, the landmarks last."""
-        every: list[PoseIncrement | RangeFrame | LandmarkFrame] = [*self.increments]
+    def in_order(self) -> list[Measurement]:
+        """All measurements in stamp order; of one instant inertial first, then increment, landmarks last."""
+        every: list[Measurement] = [*self.inertial, *self.increments]
         every += [*self.range_frames, *self.landmark_frames]
         return sorted(every, key=lambda measurement: measurement.stamp_ns)
 
@@ -65,7 +77,8 @@ def measure(scenario: Scenario) -> MeasuredWalk:
     """
     odometry, landmarks = scenario.file.increments, scenario.file.landmarks
     assert odometry is not None
-    odometry_rng, uwb_rng, landmark_rng = scenario.rng.spawn(3)
+    inertial = scenario.file.inertial
+    odometry_rng, uwb_rng, landmark_rng, inertial_rng = scenario.rng.spawn(4)
     stamps_ns, poses = _instants(scenario, odometry.rate)
     range_frames, unblocked, excess = _range_frames(scenario, uwb_rng)
     return MeasuredWalk(
@@ -76,6 +89,7 @@ def measure(scenario: Scenario) -> MeasuredWalk:
         unblocked=unblocked,
         excess=excess,
         landmark_frames=_landmark_frames(scenario, landmarks, landmark_rng) if landmarks else [],
+        inertial=draw_inertial(scenario, inertial, inertial_rng) if inertial else [],
     )
 
 
@@ -96,14 +110,15 @@ def _increments(
 ) -> list[PoseIncrement]:
     """Increments from each pose to the next.
 
-    Noise of a step is white. A trial's scale error and drift repeat in all of its steps; the covariance of a
-    step has their variance too, but nothing says that they are the same as in the step before.
+    Noise of a step is white. A trial's scale error, drift and slip repeat in all of its steps; the covariance
+    of a step has their variance too, but nothing says that they are the same as in the step before.
     """
     sigma_yaw, drift_sigma = np.deg2rad(table.sigma_yaw_deg), np.deg2rad(table.yaw_drift_deg)
     scale = table.scale_sigma * rng.standard_normal()
     drift = drift_sigma * rng.standard_normal()
     noise = rng.standard_normal((len(poses) - 1, 3)) * [table.sigma_x, table.sigma_y, sigma_yaw]
     map_cov = np.diag([table.sigma_x**2, table.sigma_y**2])
+    slips = [(place, place.slip_sigma * rng.standard_normal(2)) for place in table.diverging]
     increments = [
         PoseIncrement(int(stamps_ns[0]), int(stamps_ns[0]), np.zeros(3), np.zeros((3, 3)), is_keyframe=True)
     ]
@@ -119,11 +134,17 @@ def _increments(
         length = float(np.hypot(step[0], step[1]))
         value = step * [1.0 + scale, 1.0 + scale, 1.0]
         value[:2] += R_body_map @ step_noise[:2]
+        slip_variance = 0.0
+        for place, slip in slips:
+            if place.holds(poses[k]):
+                value[:2] += R_body_map @ slip * length
+                slip_variance += (place.slip_sigma * length) ** 2
         value[2] = wrap_angle(value[2] + drift * length + step_noise[2])
         cov = np.zeros((3, 3))
         cov[:2, :2] = R_body_map @ map_cov @ R_body_map.T + table.scale_sigma**2 * np.outer(
             step[:2], step[:2]
         )
+        cov[:2, :2] += slip_variance * np.eye(2)
         cov[2, 2] = sigma_yaw**2 + (drift_sigma * length) ** 2
         increments.append(PoseIncrement(from_ns, to_ns, value, cov, is_keyframe=True))
     return increments

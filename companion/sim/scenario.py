@@ -17,6 +17,7 @@ from companion.sim.scenario_tables import (
     Blockade,
     GaitTable,
     IncrementsTable,
+    InertialTable,
     KidnapTable,
     LandmarksTable,
     NlosTable,
@@ -55,6 +56,18 @@ class TrajectoryTable(Table):
     accel: float = Field(0.5, gt=0, le=20, description="[m/s^2]")
     turn_rate_deg: float = Field(60.0, gt=0, le=360, description="[deg/s]")
     rest: float = Field(2.0, ge=0, le=600, description="standing still before and after [s]")
+    leg_names: list[str] = Field(
+        [], description="names of the legs, in order, to have figures for each; none: for the whole alone"
+    )
+
+    @field_validator("leg_names")
+    @classmethod
+    def _one_name_a_leg(cls, names: list[str], info: ValidationInfo) -> list[str]:
+        corners, laps = len(info.data.get("waypoints", [])), info.data.get("laps", 0)
+        legs = corners * laps if laps else max(0, corners - 1)
+        if names and (len(names) != legs or len(set(names)) < legs):
+            raise ValueError(f"{legs} different names are needed, one for each leg")
+        return names
 
     @model_validator(mode="after")
     def _one_way(self) -> Self:
@@ -154,7 +167,14 @@ class ScenarioFile(Table):
     gait: GaitTable | None = None
     increments: IncrementsTable | None = None
     landmarks: LandmarksTable | None = None
+    inertial: InertialTable | None = None
     paper: PaperTable | None = None
+
+    @model_validator(mode="after")
+    def _legs_without_bytes(self) -> Self:
+        if self.trajectory.leg_names and self.increments is None:
+            raise ValueError("trajectory.leg_names: figures for legs need a table [increments]")
+        return self
 
     @field_validator("landmarks")
     @classmethod
@@ -162,6 +182,13 @@ class ScenarioFile(Table):
         if info.data.get("increments") is None:
             raise ValueError("no emulated device sends landmarks, they need a table [increments]")
         return landmarks
+
+    @field_validator("inertial")
+    @classmethod
+    def _at_a_tag_without_bytes(cls, inertial: InertialTable, info: ValidationInfo) -> InertialTable:
+        if info.data.get("increments") is None:
+            raise ValueError("the emulated tag has its own sensor [imu], this one needs a table [increments]")
+        return inertial
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from companion.config import Coordinate, Table
+from estimators.messages import FloatArray
 
 Box = tuple[float, float, float, float, float, float]
 Interval = tuple[Coordinate, Coordinate]
@@ -141,6 +142,20 @@ class GaitTable(Table):
     yaw_deg: float = Field(1.0, ge=0, le=45, description="amplitude of the heading [deg]")
 
 
+class DivergenceTable(Table):
+    """A part of the floor where the odometry slips, as a matcher does that finds no structure."""
+
+    x: Interval = Field(description="least and greatest x [m], map frame")
+    y: Interval = Field(description="the same for y [m]")
+    slip_sigma: float = Field(
+        gt=0, le=1, description="false shift along each axis of the map for every metre walked, a trial's"
+    )
+
+    def holds(self, pose: FloatArray) -> bool:
+        """Whether a pose (3,) is in it."""
+        return bool(self.x[0] <= pose[0] <= self.x[1] and self.y[0] <= pose[1] <= self.y[1])
+
+
 class IncrementsTable(Table):
     """Odometry increments in place of a LiDAR. A scenario with this table has no bytes and no scans.
 
@@ -156,6 +171,21 @@ class IncrementsTable(Table):
     yaw_drift_deg: float = Field(
         0.0, ge=0, le=45, description="false turn for every metre walked, a trial's [deg/m]"
     )
+    diverging: list[DivergenceTable] = Field([], description="where it slips")
+
+
+class InertialTable(Table):
+    """Inertial sensor at the tag, with an attitude filter of its own, in a scenario with `[increments]`.
+
+    Bias and tilt are drawn once a trial. Its heading counts from where it was switched on, and wanders.
+    """
+
+    rate: float = Field(50.0, ge=1, le=1000, description="samples and attitudes a second [Hz]")
+    accel_sigma: float = Field(0.05, ge=0, le=10, description="noise of an acceleration [m/s^2]")
+    accel_bias: float = Field(0.05, ge=0, le=10, description="standard deviation of the bias [m/s^2]")
+    gyro_sigma: float = Field(0.01, ge=0, le=10, description="noise of a turn rate [rad/s]")
+    tilt_sigma_deg: float = Field(0.3, ge=0, le=45, description="error of roll and of pitch [deg]")
+    heading_walk_deg: float = Field(0.1, ge=0, le=45, description="walk of the heading [deg/sqrt(s)]")
 
 
 class LandmarksTable(Table):
@@ -168,18 +198,27 @@ class LandmarksTable(Table):
     max_range: float = Field(8.0, gt=0, le=1000, description="[m]")
 
 
+class PaperLeg(Table):
+    """What a publication states of one estimator on one leg."""
+
+    rmse_m: Figure | None = None
+    max_m: Figure | None = None
+
+
 class PaperFigures(Table):
     """What a publication states of one estimator, under the names of our own figures."""
 
     rmse_m: Figure | None = None
+    max_m: Figure | None = None
     rmse_x_m: Figure | None = None
     rmse_y_m: Figure | None = None
     max_x_m: Figure | None = None
     max_y_m: Figure | None = None
+    legs: dict[str, PaperLeg] = Field({}, description="by the name of the leg")
 
 
 class PaperTable(Table):
     """Published figures, shown beside ours."""
 
     source: str
-    estimators: dict[str, PaperFigures] = Field(description="by the name of our estimator that is meant")
+    estimators: dict[str, PaperFigures] = Field({}, description="by the name of our estimator that is meant")

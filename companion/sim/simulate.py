@@ -61,6 +61,15 @@ def converse(
         now_ns += STEP_NS
 
 
+def records(scenario: Scenario) -> Iterator[RawChunk | Truth]:
+    """What the log of a scenario would hold, without writing one."""
+    sensors = make_sensors(scenario.config)
+    for item in converse(scenario, sensors):
+        if isinstance(item, RawChunk) and item.direction is Direction.IN:
+            sensors[item.source].feed(item.data, item.stamp_ns)
+        yield item
+
+
 def record(
     scenario: Scenario, sensors: Mapping[str, Sensor], writer: LogWriter, take: Callable[[RawChunk], None]
 ) -> Iterator[float]:

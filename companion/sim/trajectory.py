@@ -100,6 +100,11 @@ class Trajectory:
         self.duration = clock + rest
         """Time from the first rest to the end of the last [s]."""
 
+    @property
+    def legs(self) -> list[tuple[float, float]]:
+        """Begin and end of every straight leg [s]."""
+        return [(leg.begin, leg.begin + leg.duration) for leg in self._legs if not leg.is_turn]
+
     def _append(self, leg: _Leg) -> float:
         self._legs.append(leg)
         return leg.begin + leg.duration

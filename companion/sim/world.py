@@ -28,8 +28,9 @@ class World:
             corners = np.array(polyline, dtype=np.float64)
             segments.append(np.hstack([corners[:-1], corners[1:]]))
             heights += [WALL_HEIGHT] * (len(corners) - 1)
-        for x, y, length_x, length_y, yaw, height in boxes:
-            corners = box_outline(x, y, length_x, length_y, yaw)
+        self.footprints = [box_outline(*box[:5]) for box in boxes]
+        """Outlines of the boxes, closed, (5, 2) each [m]."""
+        for corners, (*_, height) in zip(self.footprints, boxes, strict=True):
             segments.append(np.hstack([corners[:-1], corners[1:]]))
             heights += [height] * 4
         self._segments = np.vstack(segments)

@@ -67,7 +67,7 @@ class Batch:
         self.scans: list[Scan] = []
         for tick in ticks:
             for outcome in tick.outcomes:
-                    if isinstance(outcome.measurement, RangeFrame):
+                if isinstance(outcome.measurement, RangeFrame):
                     self.frames.append((outcome.measurement, outcome.reports[names[0]]))
                 elif isinstance(outcome.measurement, Scan) and len(outcome.measurement.ranges):
                     self.scans.append(outcome.measurement)

@@ -1,59 +1,59 @@
-"""Motion from scans: point-to-line matching of each scan against a keyframe.
+"""Motion from scans: point-to-line matching of each scan against a keyframe, in continuous time.
 
-Each scan is brought to the instant of its last beam with the velocity just estimated (deskewed), then
-matched to the keyframe's points by Gauss-Newton on the distance from point to local line, with a robust
-weight. The covariance is the inverse Hessian, so a direction that the walls do not hold comes out wide.
+A beam is taken from where the body is at the beam's own instant. Pose and velocity at the end of the scan
+before and at the end of this one are estimated together; between them the body follows a cubic. So a scan is
+deskewed by what it says itself of the motion during it.
+
+What goes out is what the scan says alone: the motion model's share is taken out of pose and covariance
+again, and a direction that no wall holds comes out wide.
 """
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
-from scipy.spatial import cKDTree
 
-from estimators.geometry import between, compose, exponential, logarithm, rotation, transform, wrap_angle
-from estimators.messages import FloatArray, IntArray, PoseIncrement, Scan
+from estimators.geometry import inverse, rotation, transform, transform_each
+from estimators.lidar.scan_fit import NEWEST, said_by_scan, search_start, settle
+from estimators.lidar.scan_preparation import PreparedScan, ScanPreparation
+from estimators.messages import FloatArray, Measurement, PoseIncrement, Scan
+from estimators.models.motion import cubic_between, smooth_motion
 
-NORMAL_NEIGHBOURS = 5
-"""A line is fitted through this many beams to either side of each point."""
-LINE_FLATNESS = 0.25
-"""A neighbourhood whose thickness exceeds this share of its length is a corner, not a line."""
-NEIGHBOUR_GAP = 0.5
-"""Neighbouring returns further apart than this [m] belong to different surfaces."""
-NOISY_SCANS = 2.0
-"""The noise of the scan and that of the keyframe both stand in a residual."""
-DESKEW_VARIANCE = 2.5
-"""A scan is deskewed with the velocity that two noisy matches gave, which feeds their errors back.
+if TYPE_CHECKING:
+    from estimators.lidar.line_map import LineMap, Surface
 
-With m_k the error of matching points that need no deskewing, about e_k = 1.5 m_k - e_(k-1) / 4 - e_(k-2) / 4,
-whose variance is 2.5 times that of m_k.
-"""
-LEAST_EIGENVALUE = 1.0
-"""Information [1/m^2, 1/rad^2] that every direction has: what nothing observes comes out with sigma 1."""
+UNKNOWN_SPEED_SIGMA = 1.0
+"""Standard deviation of each velocity [m/s, rad/s] before the first match."""
+LEAST_GAP_NS = 1_000_000
+"""A scan that ends sooner after the one before is none that a scanner makes."""
+KEYFRAME_SHARE = 0.7
+"""When a smaller share of the surface points is matched, too little of the keyframe is still in view."""
 
-_LEAST_INFORMATION = LEAST_EIGENVALUE * np.eye(3)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Keyframe:
-    stamp_ns: int
-    points: FloatArray
-    normals: FloatArray
-    tree: cKDTree
+_LEAST_VARIANCE = 1e-9
+"""Of a pose [m^2, rad^2], so that no covariance is singular."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Match:
-    pose: FloatArray
+    """A scan in place: both states (12,), covariance of the newer (6, 6), increment and its covariance.
+
+    The share is that of the surface points that are matched.
+    """
+
+    states: FloatArray
     cov: FloatArray
-    inlier_share: float
+    increment: FloatArray
+    increment_cov: FloatArray
+    share: float
 
 
 class ScanMatcher:
     """Turns scans into increments of the body pose.
 
-    Source: Censi, "An ICP variant using a point-to-line metric", ICRA 2008, for the metric; covariance
-    from the Gauss-Newton Hessian.
+    Source: Censi, "An ICP variant using a point-to-line metric", ICRA 2008, for the metric; "An accurate
+    closed-form estimate of ICP's covariance", ICRA 2007, for the share of the keyframe's noise; Anderson and
+    Barfoot, "Full STEAM ahead", IROS 2015, for states in continuous time.
     """
 
     class Config(BaseModel):
@@ -72,165 +72,164 @@ class ScanMatcher:
         )
         keyframe_angle_deg: float = Field(20.0, gt=0, le=180, description="... or this much turn [deg]")
         min_inlier_share: float = Field(
-            0.5, gt=0, le=1, description="a match with a smaller share of matched points is refused"
+            0.5, gt=0, le=1, description="a match with a smaller share of matched surface points is refused"
         )
         min_points: int = Field(40, ge=10, le=10000, description="scans with fewer returns are skipped")
+        accel_noise: float = Field(
+            0.5,
+            gt=0,
+            le=100,
+            description="density of white acceleration [m/s^2/sqrt(Hz)]: about the robot's acceleration "
+            "times the square root of how long it lasts",
+        )
+        yaw_accel_noise: float = Field(
+            1.5,
+            gt=0,
+            le=100,
+            description="density of white angular acceleration [rad/s^2/sqrt(Hz)], likewise",
+        )
+        bandwidth: float = Field(
+            2.0,
+            gt=0,
+            le=50,
+            description="the fastest swaying, as of a gait, that scans are deskewed for [Hz]",
+        )
+        stamp_sigma_ms: float = Field(
+            1.0, ge=0, le=100, description="standard deviation of a scan's stamp [ms]"
+        )
 
-    def __init__(self, config: Config, T_body_lidar: FloatArray) -> None:
+    def __init__(
+        self, config: Config, T_body_lidar: FloatArray, preparation: ScanPreparation.Config | None = None
+    ) -> None:
         """Start without a keyframe.
 
         Args:
             config: settings.
             T_body_lidar: (3,) mounting of the lidar in the body: x [m], y [m], yaw [rad].
+            preparation: what is done with the points beforehand; by default what its Config says.
         """
+        # Numba loads slowly: only who makes a matcher waits for it.
+        from estimators.lidar import line_map
+
+        self._line_map = line_map
         self._config = config
         self._T_body_lidar = T_body_lidar
-        self._keyframe: _Keyframe | None = None
-        self._pose = np.zeros(3)
+        self._preparation = ScanPreparation(preparation or ScanPreparation.Config(), T_body_lidar)
+        self._keyframe: LineMap | None = None
+        self._keyframe_ns = 0
+        self._keyframe_is_blind = False
         self._stamp_ns = 0
-        self._twist = np.zeros(3)
+        self._state = np.zeros(6)
+        self._cov = np.zeros((6, 6))
+        self.points = np.empty((0, 2))
+        """(N, 2) [m] of the newest scan, as seen from where the body is at its end."""
+        self.points_cov = np.zeros((3, 3))
+        """(3, 3) where among the points of the newest keyframe the body was: x, y [m], yaw [rad]."""
         self.refused = 0
         """Scans that could not be matched, so that odometry began anew."""
 
-    def update(self, scan: Scan) -> PoseIncrement | None:
-        """Match one scan.
+    def update(self, measurement: Measurement) -> PoseIncrement | None:
+        """Match a scan; of other measurements, remember what the preparation needs.
 
         Returns:
             The increment from the keyframe to the end of this scan. The first scan, and a scan after
             tracking was lost, founds a keyframe instead (`from_stamp_ns == stamp_ns`). None for a scan
             with too few returns, and for one that is not newer than the last.
         """
-        stamp_ns = scan.end_stamp_ns
-        if self._keyframe is not None and stamp_ns <= self._stamp_ns:
+        if not isinstance(measurement, Scan):
+            self._preparation.observe(measurement)
             return None
-        valid = np.isfinite(scan.ranges) & (scan.ranges > 0.0)
-        if np.count_nonzero(valid) < self._config.min_points:
+        stamp_ns = measurement.end_stamp_ns
+        if self._keyframe is not None and stamp_ns < self._stamp_ns + LEAST_GAP_NS:
             return None
-        points = self._body_points(scan, valid)
-        ages = scan.beam_times[valid] - scan.beam_times[-1]
+        scan = self._preparation.prepare(measurement)
+        if len(scan.points) < self._config.min_points:
+            return None
         if self._keyframe is None:
-            return self._found_keyframe(deskew(points, ages, self._twist), stamp_ns)
-
-        dt = (stamp_ns - self._stamp_ns) * 1e-9
-        guess = compose(self._pose, exponential(self._twist * dt))
-        match = self._match(deskew(points, ages, self._twist), guess)
-        # The motion during the scan is only known once it is matched: deskew again with it.
-        twist = logarithm(between(self._pose, match.pose)) / dt
-        still = deskew(points, ages, twist)
-        match = self._match(still, match.pose)
-        if match.inlier_share < self._config.min_inlier_share:
-            # Nothing is known of the motion any more, least of all from this match.
+            return self._begin(scan)
+        match = self._match(scan, self._keyframe)
+        if match is None:
             self.refused += 1
-            self._twist = np.zeros(3)
-            return self._found_keyframe(points, stamp_ns)
+            return self._begin(scan)
 
-        self._twist = logarithm(between(self._pose, match.pose)) / dt
-        self._pose, self._stamp_ns = match.pose, stamp_ns
-        from_stamp_ns = self._keyframe.stamp_ns
-        is_keyframe = self._moved_far(match.pose)
+        self._stamp_ns, self._state, self._cov = stamp_ns, match.states[6:], match.cov
+        # A keyframe that was taken without knowing the speed is distorted, so it is left at once.
+        is_keyframe = self._keyframe_is_blind or self._moved_far() or match.share < KEYFRAME_SHARE
+        cov = match.increment_cov + self.points_cov
+        increment = PoseIncrement(self._keyframe_ns, stamp_ns, match.increment, cov, is_keyframe)
         if is_keyframe:
-            self._found_keyframe(still, stamp_ns)
-        return PoseIncrement(from_stamp_ns, stamp_ns, match.pose, match.cov, is_keyframe)
+            self._found_keyframe(is_blind=False)
+        return increment
 
-    def _body_points(self, scan: Scan, valid: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> FloatArray:
-        angles, ranges = scan.angles[valid], scan.ranges[valid]
-        in_lidar = np.column_stack([ranges * np.cos(angles), ranges * np.sin(angles)])
-        return transform(self._T_body_lidar, in_lidar)
+    def _begin(self, scan: PreparedScan) -> PoseIncrement:
+        """Found a keyframe where nothing is known of the motion."""
+        self._stamp_ns, self.points = scan.stamp_ns, scan.points
+        self._state = np.zeros(6)
+        # The points are displaced by up to half of the way during the scan, which is not known.
+        displaced = -0.5 * UNKNOWN_SPEED_SIGMA * float(scan.times[0])
+        self._cov = np.diag([displaced**2 + _LEAST_VARIANCE] * 3 + [UNKNOWN_SPEED_SIGMA**2] * 3)
+        self._found_keyframe(is_blind=True)
+        return PoseIncrement(scan.stamp_ns, scan.stamp_ns, np.zeros(3), np.zeros((3, 3)), is_keyframe=True)
 
-    def _found_keyframe(self, points: FloatArray, stamp_ns: int) -> PoseIncrement:
-        lines, normals = line_normals(points)
-        self._keyframe = _Keyframe(stamp_ns, points[lines], normals, cKDTree(points[lines]))
-        self._pose, self._stamp_ns = np.zeros(3), stamp_ns
-        return PoseIncrement(stamp_ns, stamp_ns, np.zeros(3), np.zeros((3, 3)), is_keyframe=True)
+    def _found_keyframe(self, *, is_blind: bool) -> None:
+        """The newest scan is the new keyframe, its pose the new origin.
 
-    def _moved_far(self, pose: FloatArray) -> bool:
+        The state is from now on that against the points of the keyframe. Where among them the body was at the
+        end of the scan is as uncertain as before: the last beams alone tell, and the velocity.
+        """
+        config = self._config
+        self._keyframe = self._line_map.LineMap(self.points, config.range_sigma, config.max_correspondence)
+        self._keyframe_ns, self._keyframe_is_blind = self._stamp_ns, is_blind
+        turn = np.eye(6)
+        turn[:2, :2] = turn[3:5, 3:5] = rotation(-self._state[2])
+        self._state = turn @ self._state
+        self._state[:3] = 0.0
+        self._cov = turn @ self._cov @ turn.T
+        self.points_cov = self._cov[:3, :3]
+
+    def _moved_far(self) -> bool:
         return bool(
-            np.hypot(pose[0], pose[1]) > self._config.keyframe_distance
-            or abs(pose[2]) > np.deg2rad(self._config.keyframe_angle_deg)
+            np.hypot(self._state[0], self._state[1]) > self._config.keyframe_distance
+            or abs(self._state[2]) > np.deg2rad(self._config.keyframe_angle_deg)
         )
 
-    def _match(self, points: FloatArray, pose: FloatArray) -> _Match:
-        keyframe = self._keyframe
-        assert keyframe is not None
-        sigma = self._config.range_sigma
-        information = _LEAST_INFORMATION
-        matched, least_variance = 0, NOISY_SCANS * sigma**2
-        for _ in range(20):
-            turned = points @ rotation(pose[2]).T
-            moved = turned + pose[:2]
-            distance, nearest = keyframe.tree.query(
-                moved, distance_upper_bound=self._config.max_correspondence
-            )
-            found = np.isfinite(distance)
-            matched = int(np.count_nonzero(found))
-            if matched < 3:
-                break
-            index = np.asarray(nearest)[found]
-            normals = keyframe.normals[index]
-            residual = ((moved[found] - keyframe.points[index]) * normals).sum(axis=1)
-            arm = turned[found]
-            jacobian = np.empty((matched, 3))
-            jacobian[:, :2] = normals
-            jacobian[:, 2] = normals[:, 1] * arm[:, 0] - normals[:, 0] * arm[:, 1]
-            # Cauchy weight; its scale is the noise of two scans, or what the residuals say when larger.
-            middle = matched // 2
-            scale = max(2.0 * sigma, 1.5 * float(np.partition(np.abs(residual), middle)[middle]))
-            weight = 1.0 / (1.0 + (residual / scale) ** 2)
-            variance = max(least_variance, float((weight * residual**2).sum() / weight.sum()))
-            weighted = jacobian * (weight / variance)[:, None]
-            information = jacobian.T @ weighted + _LEAST_INFORMATION
-            step = np.linalg.solve(information, -weighted.T @ residual)
-            pose = np.array([pose[0] + step[0], pose[1] + step[1], wrap_angle(pose[2] + step[2])])
-            if float(np.abs(step).max()) < 1e-4:
-                break
-        cov = DESKEW_VARIANCE * np.asarray(np.linalg.inv(information), dtype=np.float64)
-        return _Match(pose, cov, matched / len(points))
+    def _match(self, scan: PreparedScan, keyframe: "LineMap") -> _Match | None:
+        """Put a scan where it fits; leaves the deskewed points in `points` when it does."""
+        config = self._config
+        dt = (scan.stamp_ns - self._stamp_ns) * 1e-9
+        every_basis = cubic_between(1.0 + scan.times / dt, dt)
+        found = self._line_map.surface(scan.points, config.range_sigma)
+        basis = every_basis[found.own]
+        F, Q = smooth_motion(dt, config.accel_noise, config.yaw_accel_noise, config.bandwidth)
+        motion = np.hstack([-F, np.eye(6)])
+        prior = motion.T @ np.linalg.solve(Q, motion)
+        prior[:6, :6] += np.linalg.inv(self._cov)
+        predicted = np.concatenate([self._state, F @ self._state])
+        doubt = np.sqrt(np.diag(F @ self._cov @ F.T + Q)[:3])
+        start = search_start(keyframe, found, basis, predicted, doubt, dt, config.max_correspondence)
+        fit = settle(keyframe, found, basis, prior, predicted, start, self._ranges_to_walls(found))
+        if fit is None:
+            return None
+        # A bare wall looks the same everywhere: after a long gap it is only known to be one when all fits.
+        wandered = config.accel_noise * np.sqrt(dt**3 / 3.0)
+        is_another = wandered > config.max_correspondence and np.linalg.matrix_rank(fit.held, tol=0.5) < 3
+        if fit.share < config.min_inlier_share or is_another:
+            return None
 
+        in_keyframe = transform_each(every_basis @ fit.states.reshape(4, 3), scan.points)
+        self.points = transform(inverse(fit.states[NEWEST]), in_keyframe)
+        increment, cov = said_by_scan(prior, predicted, fit)
+        velocity = fit.states[9:]
+        cov += (1e-3 * config.stamp_sigma_ms) ** 2 * np.outer(velocity, velocity)
+        cov_of_state = np.linalg.inv(fit.information)[6:, 6:]
+        return _Match(
+            fit.states, 0.5 * (cov_of_state + cov_of_state.T), increment, 0.5 * (cov + cov.T), fit.share
+        )
 
-def deskew(points: FloatArray, ages: FloatArray, twist: FloatArray) -> FloatArray:
-    """Points of a moving body as seen from where it is at the end of the scan.
-
-    Args:
-        points: (N, 2) [m], each in the body frame of its own instant.
-        ages: (N,) [s], instants relative to the end of the scan (zero or negative).
-        twist: (3,) body velocity: forward [m/s], left [m/s], counter-clockwise [rad/s].
-
-    Returns:
-        (N, 2) [m], in the body frame at the end of the scan.
-    """
-    yaw = twist[2] * ages
-    c, s = np.cos(yaw), np.sin(yaw)
-    # Chord of the arc since the end of the scan, as in geometry.exponential, for every beam at once.
-    along = np.sinc(yaw / np.pi) * ages
-    across = np.sinc(yaw / (2.0 * np.pi)) * np.sin(yaw / 2.0) * ages
-    return np.column_stack(
-        [
-            c * points[:, 0] - s * points[:, 1] + along * twist[0] - across * twist[1],
-            s * points[:, 0] + c * points[:, 1] + across * twist[0] + along * twist[1],
-        ]
-    )
-
-
-def line_normals(points: FloatArray) -> tuple[IntArray, FloatArray]:
-    """Which points lie on a line with their neighbours, and its unit normal there.
-
-    Args:
-        points: (N, 2) [m] in the order of the beams.
-
-    Returns:
-        Indices (M,) of such points and their normals (M, 2).
-    """
-    count = 2 * NORMAL_NEIGHBOURS + 1
-    if len(points) < count:
-        return np.empty(0, dtype=np.int64), np.empty((0, 2))
-    windows = np.lib.stride_tricks.sliding_window_view(points, count, axis=0)
-    centred = windows - windows.mean(axis=2, keepdims=True)
-    xx, yy = (centred[:, 0] ** 2).mean(axis=1), (centred[:, 1] ** 2).mean(axis=1)
-    xy = (centred[:, 0] * centred[:, 1]).mean(axis=1)
-    half_trace, half_spread = (xx + yy) / 2.0, np.hypot((xx - yy) / 2.0, xy)
-    length, thickness = np.sqrt(half_trace + half_spread), np.sqrt(np.maximum(half_trace - half_spread, 0.0))
-    gaps = np.linalg.norm(np.diff(windows, axis=2), axis=1).max(axis=1)
-    good = (thickness < LINE_FLATNESS * length) & (gaps < NEIGHBOUR_GAP)
-    normal_angle = 0.5 * np.arctan2(2.0 * xy, xx - yy) + np.pi / 2.0
-    normals = np.column_stack([np.cos(normal_angle), np.sin(normal_angle)])[good]
-    return np.flatnonzero(good) + NORMAL_NEIGHBOURS, normals
+    def _ranges_to_walls(self, found: "Surface") -> float:
+        """Standard deviation [m] of a distance from a wall: the part of a range's that is square to it."""
+        if not len(found.points):
+            return self._config.range_sigma
+        beams = found.points - self._T_body_lidar[:2]
+        square = (beams * found.normals).sum(axis=1) ** 2 / (beams**2).sum(axis=1)
+        return self._config.range_sigma * float(np.sqrt(square.mean()))

@@ -6,9 +6,8 @@ from math import hypot, log
 import numpy as np
 
 from estimators.base import Setup
-from estimators.geometry import between, compose, logarithm
+from estimators.geometry import between, compose, transform_each
 from estimators.lidar.occupancy_grid import OccupancyGrid
-from estimators.lidar.scan_matching import deskew
 from estimators.messages import FloatArray, Measurement, PoseEstimate, PoseIncrement, Scan
 
 OBSTRUCTED = log(20.0)
@@ -95,9 +94,9 @@ class Visibility:
             return
         mounting = self._setup.lidar_in_body
         T_map_first, T_map_last = (compose(np.array([*p.xy, p.yaw]), mounting) for p in (begin, end))
-        twist = logarithm(between(T_map_first, T_map_last)) / float(scan.beam_times[-1])
         returned = np.isfinite(scan.ranges) & (scan.ranges > 0.0)
         ranges, angles = scan.ranges[returned], scan.angles[returned]
         points = np.column_stack([ranges * np.cos(angles), ranges * np.sin(angles)])
-        ages = scan.beam_times[returned] - scan.beam_times[-1]
-        self.grid.insert(T_map_last, deskew(points, ages, twist))
+        to_go = 1.0 - scan.beam_times[returned] / scan.beam_times[-1]
+        T_last_beam = to_go[:, None] * between(T_map_last, T_map_first)
+        self.grid.insert(T_map_last, transform_each(T_last_beam, points))

@@ -10,17 +10,10 @@ import pytest
 
 from companion import __version__
 from companion.config import default_toml
+from tests.command_line import companion
 from tests.conftest import SITE, write_scenario
 
 SITE_TEXT = SITE.read_text(encoding="utf-8")
-
-
-def companion(*arguments: str | Path, cwd: Path) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "companion", *map(str, arguments)]
-    environment = {**os.environ, "COLUMNS": "100", "PYTHONPATH": os.getcwd()}
-    return subprocess.run(
-        command, cwd=cwd, env=environment, text=True, capture_output=True, timeout=100, check=False
-    )
 
 
 def test_demo_leaves_everything_it_names(tmp_path: Path) -> None:
@@ -108,12 +101,22 @@ def test_help_teaches(tmp_path: Path, command: list[str]) -> None:
     assert companion("--version", cwd=tmp_path).stdout.strip() == __version__
 
 
+def test_a_fresh_interpreter_gives_the_exit_code_and_the_line_to_the_shell(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "companion", "replay", "gone.mcap"]
+    environment = {**os.environ, "PYTHONPATH": os.getcwd()}
+    done = subprocess.run(
+        command, cwd=tmp_path, env=environment, text=True, capture_output=True, timeout=100, check=False
+    )
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr == "error: cannot read gone.mcap: No such file or directory\n"
+
+
 BAD_INPUT = {
     "missing log": (["replay", "gone.mcap"], "cannot read gone.mcap: No such file or directory"),
     "no MCAP": (["replay", "text.mcap"], "text.mcap is not an MCAP file"),
     "unknown estimator": (
         ["replay", "LOG", "--estimator", "magic"],
-        "--estimator: unknown estimator 'magic', there are: ekf, graph, least_squares, lidar_odometry",
+        "--estimator: unknown estimator 'magic', there are: ekf, gd, gd_pf, graph, least_squares, ",
     ),
     "wrong set": (["replay", "LOG", "--set", "pipeline.rate=999"], "pipeline.rate: Input should be less"),
     "missing site": (["run", "--site", "gone.toml"], "cannot read gone.toml: No such file or directory"),
@@ -131,12 +134,15 @@ BAD_INPUT = {
     ),
     "wrong link": (
         ["run", "--site", "demo_room", "--mavlink", "udpout:nonsense"],
-        "mavlink.url: 'udpout:nonsense' is no pymavlink device string",
+        "mavlink.url: 'udpout:nonsense' is no device string",
     ),
-    "link is a file": (["run", "--site", "demo_room", "--mavlink", "text.mcap"], "text.mcap is a file"),
+    "link is a file": (
+        ["run", "--site", "demo_room", "--mavlink", "text.mcap"],
+        "'text.mcap' is no device string: it is a file",
+    ),
     "unknown scenario": (
         ["emulate", "moon"],
-        "no file moon and none of that name in params/scenarios; there are: hostile_room, huang2024, ",
+        "no file moon and none of that name in params/scenarios; there are: chen2019, corridor, ",
     ),
     "unwritable log": (["simulate", "square_room", "--out", "text.mcap/log"], "cannot write the log"),
     "unwritable folder": (["demo", "--out", "text.mcap/demo"], "cannot write the log"),

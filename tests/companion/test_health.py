@@ -67,6 +67,23 @@ def test_degraded_but_sent_while_one_sensor_is_missing(
     assert what in health.reason
 
 
+def test_dead_reckoning_without_ranges_is_bounded() -> None:
+    monitor = monitor_at(30.0, ranges_until=3.0)
+    assert state(monitor, 22.9, pose()) is State.DEGRADED
+    health = monitor.judge(pose(), round(23.1 * SECOND))
+    assert health.state is State.LOST
+    assert "no range accepted for 20.1 s" in health.reason
+
+
+def test_a_heading_that_nobody_needs_may_be_unknown() -> None:
+    cov = np.diag([0.01, 0.01, 0.01, 0.01, 0.01, np.inf])
+    for needs_heading, expected in ((True, State.LOST), (False, State.OK)):
+        monitor = HealthMonitor(HealthTable.model_validate({}), True, False, needs_heading=needs_heading)
+        for stamp_ns in range(0, 5 * SECOND, SECOND // 10):
+            monitor.observe(ranges(stamp_ns), Report((Verdict.ACCEPTED,) * 4))
+        assert monitor.judge(pose(cov), 5 * SECOND).state is expected
+
+
 def test_a_sensor_that_never_speaks_is_degraded_after_a_while() -> None:
     assert state(monitor_at(5.0, increments_until=-1.0), 5.0, pose()) is State.DEGRADED
 

@@ -80,6 +80,7 @@ def test_blocked_anchors_are_refused_and_counted_with_and_without_bytes(tmp_path
     path = write_scenario(tmp_path, WALK + kind + EXCESS + BLOCKED)
     figures = run_trial(path, 3, [], ["ekf"])["ekf"]
     assert figures is not None
+    assert figures.ranges is not None
     # Two anchors for two seconds at 25 Hz, and what stands in the room.
     assert figures.ranges.biased >= 98
     assert figures.ranges.biased_rejected > 0.9 * figures.ranges.biased

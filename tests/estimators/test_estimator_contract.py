@@ -170,9 +170,9 @@ def test_honest_stream_gives_the_true_pose(name: str) -> None:
     pose = started(name).pose_at(2 * SECOND_NS)
     assert pose is not None
     assert_pose_is_sound(pose, 2 * SECOND_NS)
-    # An estimator without heading is off by the lever arm at most.
+    # An estimator without heading is off by the lever arm at most, one of few particles by millimetres more.
     distance = float(np.linalg.norm(pose.xy - SETUP.start.pose[:2]))
-    assert distance <= float(np.linalg.norm(SETUP.tag_in_body[:2])) + 1e-6
+    assert distance <= float(np.linalg.norm(SETUP.tag_in_body[:2])) + 0.01
 
 
 @EVERY_ESTIMATOR

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from tools.bench import decoders, rows
+from tools.bench import decoders, growth, processes, rows
 from tools.bench.__main__ import BASELINE, BENCHMARKS
 from tools.bench.peers import PacketParser
 from tools.bench.rows import TOLERANCE, Benchmark, Row, measure, shortfalls
@@ -104,3 +104,27 @@ def test_a_peer_that_makes_other_points_of_the_bytes_is_not_compared(monkeypatch
     monkeypatch.setattr(decoders, "packet_parsers", {"standard": {"wrong 1.0": parser}}.get)
     with pytest.raises(decoders.DisagreementError, match=r"wrong 1\.0, standard scan: differs from ours by"):
         decoders.rplidar_standard_decode()
+
+
+def test_the_growth_of_a_cost_is_the_exponent_of_its_power_law() -> None:
+    sizes = [1.0, 2.0, 4.0, 8.0, 16.0, 32.0]
+    # A constant share, as every call has one, does not hide how the rest grows.
+    curve = growth.Curve("n", "us", sizes, [1.0 + 0.5 * size**2 for size in sizes])
+    assert curve.exponent == pytest.approx(2.0, abs=0.05)
+    assert growth.Curve("n", "us", sizes, [3.0 * size for size in sizes]).exponent == pytest.approx(1.0)
+
+
+def test_growth_with_anchors_is_measured_on_as_many_ranges(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(growth, "_UPDATES", 3)
+    monkeypatch.setattr(growth, "_ROUNDS", 1)
+    curve = growth.anchors()
+    assert curve.sizes == [4.0, 8.0, 16.0, 32.0]
+    assert all(cost > 0.0 for cost in curve.costs)
+
+
+def test_the_start_of_the_program_is_a_row_with_its_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(processes, "_STARTS", 1)
+    row = processes.startup_help_s()
+    assert (row.unit, row.better, row.peer) == ("s", "lower", 0.5)
+    assert row.ratio == pytest.approx(0.5 / row.ours)
+    assert 0.01 < row.ours < 60.0

@@ -17,11 +17,11 @@ import typer
 from rich.console import Console
 from rich.progress import Progress
 
-from tools.bench import chain, decoders, smoother
+from tools.bench import chain, decoders, growth, matching, processes, smoother
 from tools.bench.decoders import DisagreementError
 from tools.bench.rows import ROUNDS, TOLERANCE, Row, measure, shortfalls, table
 
-BENCHMARKS = {**decoders.BENCHMARKS, **chain.BENCHMARKS, **smoother.BENCHMARKS}
+BENCHMARKS = {**decoders.BENCHMARKS, **matching.BENCHMARKS, **chain.BENCHMARKS, **smoother.BENCHMARKS}
 BASELINE = Path(__file__).with_name("baseline.json")
 
 
@@ -30,15 +30,21 @@ def main(
     json_file: Annotated[
         Path | None, typer.Option("--json", metavar="FILE", help="Write the rows here too.")
     ] = None,
+    curves: Annotated[bool, typer.Option("--growth", help="Instead of rows, how costs grow.")] = False,
     check: Annotated[
         bool, typer.Option("--check", help="Exit with 1 if a ratio falls short of the baseline.")
     ] = False,
 ) -> None:
     """Measure the hot paths beside what others make of the same bytes."""
-    names = only.split(",") if only else list(BENCHMARKS)
+    if curves:
+        title = f"Python {platform.python_version()}, {datetime.date.today()}; CPU time"
+        Console().print(growth.curves_table([curve() for curve in growth.CURVES], title))
+        return
+    known = [*BENCHMARKS, *processes.ROWS]
+    names = only.split(",") if only else known
     for name in names:
-        if name not in BENCHMARKS:
-            raise typer.BadParameter(f"{name!r} is no row, there are: {', '.join(BENCHMARKS)}")
+        if name not in known:
+            raise typer.BadParameter(f"{name!r} is no row, there are: {', '.join(known)}")
     try:
         rows = _measured(names)
     except DisagreementError as error:
@@ -63,7 +69,8 @@ def _measured(names: list[str]) -> list[Row]:
         task = progress.add_task("", total=len(names))
         for name in names:
             progress.update(task, description=name)
-            rows.append(measure(name, BENCHMARKS[name]()))
+            whole = processes.ROWS.get(name)
+            rows.append(whole() if whole else measure(name, BENCHMARKS[name]()))
             progress.advance(task)
     return rows
 

@@ -14,22 +14,8 @@ from companion.sim.scenario import load_scenario
 from companion.sim.simulate import simulate
 from drivers import make_sensor
 from estimators import make_estimator
-from estimators.lidar.scan_matching import ScanMatcher
-from estimators.messages import Measurement, RangeFrame, Scan
+from estimators.messages import Measurement, RangeFrame
 from tools.bench.rows import Benchmark
-
-
-def scan_match() -> Benchmark:
-    """A hundred scans of a walking robot, one after the other."""
-    config = _config()
-    scans = [m for m in _measurements("lidar") if isinstance(m, Scan)][50:150]
-
-    def match() -> None:
-        matcher = ScanMatcher(config.scan_matcher, config.lidar_mounting())
-        for scan in scans:
-            matcher.update(scan)
-
-    return Benchmark("ms/scan", "lower", len(scans) / 1e3, match)
 
 
 def range_update_ekf() -> Benchmark:
@@ -44,15 +30,15 @@ def range_update_least_squares() -> Benchmark:
 
 def replay_real_time_factor() -> Benchmark:
     """The log through `ekf`: its duration over the time that this takes."""
-    log = Log(_log())
+    log = Log(demo_log())
     config = config_of(log, [])
     duration = replay(log, config, ["ekf"]).duration
     return Benchmark("x", "higher", duration, lambda: replay(log, config, ["ekf"]), needed=("real time", 1.0))
 
 
 def _range_update(name: str) -> Benchmark:
-    config = _config()
-    frames = [m for m in _measurements("uwb") if isinstance(m, RangeFrame)]
+    config = demo_config()
+    frames = [m for m in measurements("uwb") if isinstance(m, RangeFrame)]
 
     def update() -> None:
         estimator = make_estimator(name, config.estimator_config(name), config.setup())
@@ -63,7 +49,7 @@ def _range_update(name: str) -> Benchmark:
 
 
 @cache
-def _log() -> Path:
+def demo_log() -> Path:
     """Log of the demo's walk, simulated once."""
     folder = Path(mkdtemp(prefix="bench-"))
     atexit.register(rmtree, folder)
@@ -74,24 +60,24 @@ def _log() -> Path:
 
 
 @cache
-def _config() -> Config:
+def demo_config() -> Config:
+    """Of the demo's site."""
     return load_config(params_dir() / "sites" / "demo_room.toml")
 
 
-def _measurements(source: str) -> list[Measurement]:
+def measurements(source: str) -> list[Measurement]:
     """All that a sensor measured on the walk."""
-    table = _config().sensor[source]
+    table = demo_config().sensor[source]
     sensor = make_sensor(table.driver, table.settings)
     return [
         measurement
-        for record in Log(_log())
+        for record in Log(demo_log())
         if isinstance(record, RawChunk) and record.source == source and record.direction is Direction.IN
         for measurement in sensor.feed(record.data, record.stamp_ns)
     ]
 
 
 BENCHMARKS: dict[str, Callable[[], Benchmark]] = {
-    "scan_match": scan_match,
     "range_update_ekf": range_update_ekf,
     "range_update_least_squares": range_update_least_squares,
     "replay_real_time_factor": replay_real_time_factor,

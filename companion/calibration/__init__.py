@@ -1,0 +1,1 @@
+"""What a drive tells of the sensors: range biases, lever arms, clock offsets."""

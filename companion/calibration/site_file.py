@@ -1,0 +1,50 @@
+"""Calibrated values written into a site file; comments and order stay."""
+
+from pathlib import Path
+from typing import Any
+
+import tomlkit
+from tomlkit.items import Table
+
+from companion.calibration.ranges import Calibration
+from companion.config import config_from_toml, read_text
+from companion.errors import UserError
+
+
+def write_range_bias(site: Path, calibration: Calibration, to: Path) -> None:
+    """Put a calibration into the table `[range_bias]` of a site file.
+
+    Args:
+        site: file to read.
+        calibration: what to write.
+        to: file to write; may be the same.
+
+    Raises:
+        UserError: the site file is wrong, or would be with these values, or cannot be written.
+    """
+    document = tomlkit.parse(read_text(site))
+    table = _table(document, "range_bias")
+    table["common"] = round(calibration.common, 4)
+    table["common_sigma"] = round(calibration.common_sigma, 4)
+    anchors = _table(table, "anchors")
+    for anchor_id, fit in calibration.anchors.items():
+        row = tomlkit.inline_table()
+        row["constant"] = round(fit.bias.constant - calibration.common, 4)
+        row["constant_sigma"] = round(fit.constant_sigma, 4)
+        row["per_metre"] = round(fit.bias.per_metre, 5)
+        row["per_metre_sigma"] = round(fit.per_metre_sigma, 5)
+        row["distance"] = round(fit.bias.distance, 3)
+        anchors[str(anchor_id)] = row
+    text = tomlkit.dumps(document)
+    config_from_toml(text, str(to))
+    try:
+        to.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise UserError(f"cannot write {to}: {error.strerror}") from error
+
+
+def _table(parent: Any, name: str) -> Any:
+    if name not in parent:
+        parent[name] = tomlkit.table()
+    assert isinstance(parent[name], Table)
+    return parent[name]

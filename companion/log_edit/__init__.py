@@ -1,0 +1,1 @@
+"""What a log would hold had something gone wrong: faults put into recorded bytes afterwards."""

@@ -1,0 +1,78 @@
+"""`companion sitl`: let a simulated vehicle fly on our pose alone."""
+
+import signal
+import threading
+import time
+from datetime import datetime
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+from rich.console import Console
+from rich.markup import escape
+
+from companion.config import params_dir
+
+EXIT_NOT_FOLLOWED = 1
+
+
+def sitl(
+    connect: Annotated[
+        str,
+        typer.Option("--connect", metavar="URL", help="The simulated autopilot, e.g. tcp:127.0.0.1:5760."),
+    ],
+    world: Annotated[
+        str,
+        typer.Option("--world", metavar="SCENARIO", help="Scenario file, or the name of one of ours."),
+    ] = "square_room",
+    seconds: Annotated[
+        float | None, typer.Option("--seconds", min=1, help="End after so long; default: Ctrl-C.")
+    ] = None,
+    folder: Annotated[
+        Path | None, typer.Option("--out", metavar="DIR", help="Run folder; default out/sitl-DATE-TIME.")
+    ] = None,
+    seed: Annotated[int | None, typer.Option("--seed", min=0, metavar="N", help="Of the noise.")] = None,
+    sets: Annotated[
+        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Change a setting of the site.")
+    ] = None,
+) -> None:
+    """Fly a simulated vehicle on our pose alone.
+
+    ArduPilot's SITL says where its vehicle truly is. From there the world's UWB and LiDAR bytes are rendered,
+    run through drivers and estimator, and the pose goes back to SITL's filter. Set that up once with
+    [bold]companion params apply uwb_lidar --mavlink URL[/] and a restart. At the end it prints how well the
+    autopilot followed.
+
+    Exit codes: 0 it followed, 1 it had no position of its own, 2 the call is wrong or there is no SITL.
+    """
+    from companion.sim.scenario import load_scenario
+    from companion.sitl import SitlRun
+
+    out, err = Console(highlight=False, soft_wrap=True), Console(stderr=True, highlight=False)
+    path = Path(world) if Path(world).is_file() else params_dir() / "scenarios" / f"{world}.toml"
+    folder = folder or Path("out") / datetime.now().astimezone().strftime("sitl-%Y%m%d-%H%M%S")
+    begin = time.monotonic()
+
+    def say(line: str) -> None:
+        err.print(f"[dim]{time.monotonic() - begin:8.1f}[/]  {escape(line)}", soft_wrap=True)
+
+    say(f"waiting for the autopilot on {connect}")
+    run = SitlRun(load_scenario(path, seed, sets or []), connect, folder, say)
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    if seconds is not None:
+        timer = threading.Timer(seconds, stop.set)
+        timer.daemon = True
+        timer.start()
+    run.run(stop)
+    errors = run.our_errors()
+    if len(errors):
+        rmse = float(np.sqrt(np.mean(np.square(errors))))
+        out.print(f"companion: {len(errors)} poses, RMSE {rmse:.3f} m, max {errors.max():.3f} m")
+    for line in run.score.lines():
+        out.print(line, markup=False)
+    out.print(f"log: {folder / 'raw.mcap'}")
+    if not run.score.errors:
+        raise typer.Exit(EXIT_NOT_FOLLOWED)

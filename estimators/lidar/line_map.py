@@ -1,0 +1,127 @@
+"""A scan as local lines, to match points against; numba is loaded with this module."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from estimators.kernels.scan_lines import (
+    associate,
+    fit_lines,
+    noise_of_points,
+    normal_equations,
+    sort_into_cells,
+)
+from estimators.messages import FloatArray, IntArray
+
+LINE_REACH = 10.0
+"""Half the length of the neighbourhood through which a line is fitted, in standard deviations of a range."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Surface:
+    """Points of a scan that lie on a line with their neighbours.
+
+    Attributes:
+        lines: (M, 6) as `fit_lines` gives them.
+        spans: (M, 2) first and last point of each line.
+        own: (M,) which point each line belongs to.
+        points: (M, 2) these points [m].
+    """
+
+    lines: FloatArray
+    spans: IntArray
+    own: IntArray
+    points: FloatArray
+
+    @property
+    def normals(self) -> FloatArray:
+        """Unit normals (M, 2)."""
+        return np.ascontiguousarray(self.lines[:, 2:4])
+
+
+def surface(points: FloatArray, range_sigma: float) -> Surface:
+    """Lines through points (N, 2) [m] in the order of the beams, whose ranges have this noise [m]."""
+    lines, spans, own = fit_lines(points, LINE_REACH * range_sigma, range_sigma)
+    return Surface(lines, spans, own, points[own])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sums:
+    """What all matched points say of the state, for distances of unit variance.
+
+    Attributes:
+        hessian: (12, 12) and gradient (12,), by the state as `LineMap.match` takes it.
+        pose_hessian: (3, 3) by the pose alone.
+        feigned: (3, 3) what noise of the normals adds to `pose_hessian` on average.
+        by_line: (M, 3) change of the gradient by the pose with the offset of each line.
+        weight: sum of the weights.
+        squares: weighted sum of squared distances [m^2].
+    """
+
+    hessian: FloatArray
+    gradient: FloatArray
+    pose_hessian: FloatArray
+    feigned: FloatArray
+    by_line: FloatArray
+    weight: float
+    squares: float
+
+
+class LineMap:
+    """Lines of one scan in a grid of cells.
+
+    Args:
+        points: (N, 2) [m] in the order of the beams, in the frame of the map.
+        range_sigma: standard deviation of a range [m].
+        reach: points further than this from a line's foot are not matched [m].
+    """
+
+    def __init__(self, points: FloatArray, range_sigma: float, reach: float) -> None:
+        found = surface(points, range_sigma)
+        feet = found.lines[:, :2]
+        lower, upper = (feet.min(axis=0), feet.max(axis=0)) if len(feet) else np.zeros((2, 2))
+        columns, rows = ((upper - lower) // reach).astype(np.int64) + 1
+        self._grid = np.array([*lower, reach])
+        self._columns = int(columns)
+        self._lines, order, self._begin = sort_into_cells(found.lines, self._grid, self._columns, int(rows))
+        self._spans = found.spans[order]
+        self._points = len(points)
+
+    def match(
+        self, points: FloatArray, normals: FloatArray, basis: FloatArray, state: FloatArray
+    ) -> tuple[FloatArray, IntArray]:
+        """Hold points against their nearest lines.
+
+        Args:
+            points: (N, 2) [m], each in the body frame of its own instant.
+            normals: (N, 2) unit normals of the surface there, likewise.
+            basis: (N, 4) weights of the state's four vectors in the pose at that instant.
+            state: (12,) pose and velocity, then pose and velocity, in the frame of the map.
+
+        Returns:
+            (N, 6) signed distance [m], its derivative by the pose at the instant (3,), the lever arm of the
+            point in the axes of the map (2,); and which line, (N,), -1 without one.
+        """
+        rows, index = np.empty((len(points), 6)), np.empty(len(points), dtype=np.int64)
+        associate(
+            points, normals, basis, state, self._lines, self._begin, self._grid, self._columns, rows, index
+        )
+        return rows, index
+
+    def sums(self, basis: FloatArray, rows: FloatArray, index: IntArray, scale: float) -> Sums:
+        """Add up what `match` found.
+
+        Args:
+            basis: (N, 4) as given to `match`.
+            rows: (N, 6) of `match`.
+            index: (N,) of `match`.
+            scale: of the Cauchy weight [m].
+        """
+        return Sums(*normal_equations(basis, rows, index, self._lines, scale))
+
+    def gradient_noise(self, by_line: FloatArray) -> FloatArray:
+        """Covariance (3, 3) of the gradient by the pose from noise of this map's points, of unit variance.
+
+        Lines share their points with their neighbours, and many points may be matched to one line.
+        """
+        return noise_of_points(by_line, self._spans, self._points)

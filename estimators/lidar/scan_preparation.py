@@ -1,0 +1,104 @@
+"""What becomes of a scan before anything is made of it: limits, thinning, levelling, lever arm."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from estimators.geometry import transform
+from estimators.messages import Attitude, FloatArray, Measurement, Scan
+
+MOST_ATTITUDE_AGE = 0.2
+"""An older attitude [s] levels no scan."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PreparedScan:
+    """Where beams ended.
+
+    Attributes:
+        stamp_ns: time of the last beam, whether it came back or not.
+        points: (N, 2) [m] in the order of the beams, each in the level body frame of its own instant.
+        times: (N,) [s] of the beams, relative to `stamp_ns` (zero or negative).
+    """
+
+    stamp_ns: int
+    points: FloatArray
+    times: FloatArray
+
+
+class ScanPreparation:
+    """Turns the device's polar scans into points of the body frame."""
+
+    class Config(BaseModel):
+        """Settings of the preparation."""
+
+        model_config = ConfigDict(extra="forbid", frozen=True)
+
+        min_range: float = Field(0.1, ge=0, le=100, description="nearer returns are the robot itself [m]")
+        max_range: float = Field(
+            100.0, gt=0, le=1000, description="returns from further away are left out [m]"
+        )
+        max_points: int = Field(
+            2000,
+            ge=20,
+            le=100_000,
+            description="of a scan with more returns every second (third, ...) is left",
+        )
+        level: bool = Field(
+            False,
+            description="bring points to the horizontal by the attitude that a sensor on the body measures",
+        )
+        max_rise: float = Field(
+            0.3,
+            gt=0,
+            le=10,
+            description="with level: returns further above or below the scanner than this are the floor or "
+            "another part of a thing, and left out [m]",
+        )
+
+    def __init__(self, config: Config, T_body_lidar: FloatArray) -> None:
+        """Prepare scans of one scanner.
+
+        Args:
+            config: settings.
+            T_body_lidar: (3,) mounting of the lidar in the body: x [m], y [m], yaw [rad].
+        """
+        self._config = config
+        self._T_body_lidar = T_body_lidar
+        self._attitude: Attitude | None = None
+
+    def observe(self, measurement: Measurement) -> None:
+        """Remember the newest attitude; other measurements and bad ones say nothing."""
+        if isinstance(measurement, Attitude) and abs(np.linalg.norm(measurement.quat_wxyz) - 1.0) < 0.01:
+            self._attitude = measurement
+
+    def prepare(self, scan: Scan) -> PreparedScan:
+        """The returns of a scan that are good for anything."""
+        config = self._config
+        with np.errstate(invalid="ignore"):
+            good = (scan.ranges > 0.0) & (scan.ranges >= config.min_range) & (scan.ranges <= config.max_range)
+        good &= np.isfinite(scan.angles)
+        kept = np.flatnonzero(good)
+        kept = kept[:: -(-len(kept) // config.max_points) or 1]
+        angles, ranges, stamp_ns = scan.angles[kept], scan.ranges[kept], scan.end_stamp_ns
+        in_lidar = np.column_stack([ranges * np.cos(angles), ranges * np.sin(angles)])
+        points = transform(self._T_body_lidar, in_lidar)
+        times = scan.beam_times[kept] - (scan.beam_times[-1] if len(scan.beam_times) else 0.0)
+        if config.level and self._attitude is not None:
+            age = abs(stamp_ns - self._attitude.stamp_ns) * 1e-9
+            if age <= MOST_ATTITUDE_AGE:
+                level = points @ _tilt(self._attitude.quat_wxyz)[:, :2].T
+                near = np.abs(level[:, 2]) <= config.max_rise
+                points, times = np.ascontiguousarray(level[near, :2]), times[near]
+        return PreparedScan(stamp_ns, points, times)
+
+
+def _tilt(quat_wxyz: FloatArray) -> FloatArray:
+    """`R_level_body` (3, 3): roll and pitch of an attitude, without its heading."""
+    w, x, y, z = quat_wxyz / np.linalg.norm(quat_wxyz)
+    # Third row of the rotation matrix: where up is in the body.
+    up = np.array([2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)])
+    forward = np.array([1.0, 0.0, 0.0]) - up[0] * up
+    forward /= np.linalg.norm(forward)
+    return np.array([forward, np.cross(up, forward), up])

@@ -1,0 +1,89 @@
+"""Scanners of many kinds from settings alone: field of view, rate and range."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from companion.sim.world import World
+from estimators.geometry import compose
+from estimators.lidar.scan_matching import ScanMatcher
+from estimators.messages import Scan
+from tests.estimators.lidar.room_scans import Loop, true_increment
+
+
+@dataclass(frozen=True)
+class Scanner:
+    beams: int
+    field_of_view: float
+    rate: float
+    reach: float
+    sigma: float
+    scale: float = 1.0
+    """Of the world: 1 is a room of 6 m x 4.5 m."""
+
+
+RPLIDAR_SHORT = Scanner(400, 2 * np.pi, 8.0, 4.0, 0.015)
+SICK_180 = Scanner(361, np.pi, 12.0, 30.0, 0.015)
+SICK_270 = Scanner(811, 1.5 * np.pi, 15.0, 25.0, 0.015)
+FAR = Scanner(1440, 2 * np.pi, 10.0, 80.0, 0.02, scale=15.0)
+SLOW = Scanner(800, 2 * np.pi, 3.0, 12.0, 0.015)
+
+
+def world(scale: float) -> World:
+    corners = scale * np.array([[0.0, 0.0], [6.0, 0.0], [6.0, 4.5], [0.0, 4.5], [0.0, 0.0]])
+    box = (*(scale * np.array([4.6, 3.1, 0.8, 0.6])), 0.2, 2.0)
+    other = (*(scale * np.array([0.7, 3.6, 0.6, 0.4])), 0.5, 2.0)
+    return World([[(float(x), float(y)) for x, y in corners]], [box, other])
+
+
+def scan_by(scanner: Scanner, here: World, path: Loop, start: float, rng: np.random.Generator) -> Scan:
+    """Beams from left to right, as an RPLIDAR turns."""
+    share = np.arange(scanner.beams) / scanner.beams
+    angles = scanner.field_of_view * (0.5 - share)
+    times = share * scanner.field_of_view / (2.0 * np.pi) / scanner.rate
+    poses = path.poses(start + times)
+    # The path stays as it is while the room grows: round the middle of the lower left quarter.
+    origins = poses[:, :2] + (scanner.scale - 1.0) * np.array([2.6, 1.9])
+    ranges = here.ray_cast(origins, poses[:, 2] + angles, 0.4)
+    ranges = ranges + rng.normal(0.0, scanner.sigma, scanner.beams)
+    ranges = np.where((ranges < scanner.reach) & (ranges > 0.05), ranges, 0.0)
+    return Scan(round(start * 1e9), angles, ranges, times, np.zeros(scanner.beams))
+
+
+@pytest.mark.parametrize(
+    ("scanner", "speed", "settings"),
+    [
+        (RPLIDAR_SHORT, 0.5, {}),
+        (SICK_180, 0.5, {}),
+        (SICK_270, 0.5, {}),
+        (FAR, 0.5, {"keyframe_distance": 2.0, "range_sigma": 0.02}),
+        (SLOW, 0.25, {"accel_noise": 0.2, "yaw_accel_noise": 0.3, "bandwidth": 0.5}),
+    ],
+    ids=["4 m", "180 deg", "270 deg", "80 m", "3 Hz"],
+)
+def test_a_scanner_is_followed_for_ten_seconds(
+    scanner: Scanner, speed: float, settings: dict[str, float]
+) -> None:
+    here, path, rng = world(scanner.scale), Loop(speed), np.random.default_rng(1)
+    matcher = ScanMatcher(ScanMatcher.Config.model_validate(settings), np.zeros(3))
+    pose, keyframe, nees = np.zeros(3), np.zeros(3), []
+    first_ns = last_ns = 0
+    for k in range(round(10.0 * scanner.rate)):
+        found = matcher.update(scan_by(scanner, here, path, k / scanner.rate, rng))
+        assert found is not None
+        if found.from_stamp_ns == found.stamp_ns:
+            first_ns = found.stamp_ns
+            continue
+        pose, last_ns = compose(keyframe, found.increment), found.stamp_ns
+        if found.is_keyframe:
+            keyframe = pose
+        error = found.increment - true_increment(path, found.from_stamp_ns, found.stamp_ns)
+        error[2] = np.angle(np.exp(1j * error[2]))
+        nees.append(error @ np.linalg.solve(found.cov, error))
+    assert matcher.refused == 0
+    drift = pose - true_increment(path, first_ns, last_ns)
+    assert np.hypot(drift[0], drift[1]) < 0.05
+    assert abs(np.rad2deg(np.angle(np.exp(1j * drift[2])))) < 1.5
+    # Errors of consecutive increments are correlated: their mean is not chi-square, so a factor is asked.
+    assert 3.0 / 4.0 < np.mean(nees) < 3.0 * 2.5
