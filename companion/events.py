@@ -71,7 +71,7 @@ class EventFinder:
         self._config, self._primary = config, primary
         self._blocked: dict[int, _Refusals] = {}
         self._contradiction: _Refusals | None = None
-        self._misses = {i: RangeMisses() for i in config.anchors}
+        self._misses = RangeMisses()
         self._heard_ns: dict[str, int] = {}
         self._silent: set[str] = set()
         self._health: Health | None = None
@@ -88,7 +88,7 @@ class EventFinder:
         pose = tick.poses[self._primary]
         for outcome in tick.outcomes:
             if isinstance(outcome.measurement, RangeFrame):
-                self._take_ranges(outcome.measurement, outcome.reports[self._primary], pose, tick.health)
+                self._take_ranges(outcome.measurement, outcome.reports[self._primary], pose)
             elif isinstance(outcome.measurement, Scan):
                 self._take_sign("scans", outcome.measurement.end_stamp_ns)
         self._close_stories(tick.stamp_ns - GAP_NS)
@@ -105,17 +105,18 @@ class EventFinder:
             self._tell_silence(name, self._stamp_ns, "until the end")
         if self._lost_ns is not None:
             self._tell_lost("until the end")
-        for i, misses in self._misses.items():
-            shift = misses.shift()
-            if shift is not None:
-                x, y = shift.shift
-                self._tell(
-                    shift.stamp_ns,
-                    f"A{i} moved",
-                    f"its ranges fit a place {np.hypot(x, y):.2f} m from the site file's, "
-                    f"x {x:+.2f} y {y:+.2f} m: "
-                    f"they miss by {shift.after:.2f} m there, by {shift.before:.2f} m as it is",
-                )
+        shift = self._misses.shift()
+        if shift is not None:
+            x, y = shift.shift
+            biased = "" if shift.bias is None else f"; or all its ranges err by {shift.bias:+.2f} m"
+            self._tell(
+                shift.stamp_ns,
+                f"A{shift.anchor_id} moved" + " or biased" * bool(biased),
+                f"the ranges fit a place of it {np.hypot(x, y):.2f} m from the site file's, x {x:+.2f} "
+                f"y {y:+.2f} m: they miss by {shift.after:.2f} m with it there, {shift.before:.2f} m as it is"
+                + biased,
+            )
+        for i in self._config.anchors:
             if f"A{i}" not in self._heard_ns and self._heard_ns:
                 self._tell(
                     self._begin_ns, f"A{i} never heard", "not one range: its power, its id in the site file?"
@@ -126,13 +127,11 @@ class EventFinder:
     def _tell(self, stamp_ns: int, title: str, text: str) -> None:
         self._found.append(Event(stamp_ns, title, text))
 
-    def _take_ranges(
-        self, frame: RangeFrame, report: Report, pose: PoseEstimate | None, health: Health
-    ) -> None:
+    def _take_ranges(self, frame: RangeFrame, report: Report, pose: PoseEstimate | None) -> None:
         known = [
             (k, i, report.verdicts[k])
             for k, i in enumerate(frame.anchor_ids[: len(report.verdicts)].tolist())
-            if i in self._misses and report.verdicts[k] is not Verdict.NOT_USED
+            if i in self._config.anchors and report.verdicts[k] is not Verdict.NOT_USED
         ]
         tag = None if pose is None else _tag(pose, np.array(self._config.body.tag[:2]))
         refused = 0
@@ -150,9 +149,9 @@ class EventFinder:
             if i in self._blocked:
                 self._blocked[i].seen += 1
                 self._blocked[i].refused += is_refused
-            if tag is not None and health.sends:
+            if tag is not None:
                 anchor = np.array(self._config.anchors[i][:2])
-                self._misses[i].add(frame.stamp_ns, residual, tag - anchor)
+                self._misses.add(frame.stamp_ns, i, residual, tag - anchor)
         self._take_contradiction(frame.stamp_ns, refused, len(known))
 
     def _take_contradiction(self, stamp_ns: int, refused: int, known: int) -> None:
