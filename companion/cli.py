@@ -22,6 +22,7 @@ from companion.errors import UserError
 from companion.evaluate_cli import app as evaluate_app
 from companion.log_cli import edit, export, import_recording, make_map
 from companion.params_cli import app as params_app
+from companion.review_cli import review
 from companion.sitl_cli import sitl
 from companion.smooth_cli import smooth
 from companion.terminal import Seed, Sets, message_console, progress, result_console
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
     from companion.live import LiveRun, LiveStatus
     from companion.log import Log
     from companion.sim.scenario import Scenario
+    from companion.view.viewer import Shown
 
 EXIT_BAD_INPUT = 2
 
@@ -60,6 +62,7 @@ app.add_typer(calibrate_app, name="calibrate")
 app.command()(sitl)
 app.add_typer(evaluate_app, name="evaluate", cls=_ScenarioUnlessNamed)
 app.command()(smooth)
+app.command()(review)
 app.command("map")(make_map)
 app.command()(edit)
 app.command("import")(import_recording)
@@ -68,6 +71,15 @@ out, err = result_console(), message_console()
 
 Scenario_ = Annotated[
     str, typer.Argument(metavar="SCENARIO", help="Scenario file, or the name of one in params/scenarios.")
+]
+View = Annotated[
+    str,
+    typer.Option(
+        "--view",
+        metavar="WHERE",
+        help="Show it in Rerun while it runs: web (a page for a browser, see the table view), native (a "
+        "window on this computer) or off.",
+    ),
 ]
 
 
@@ -136,6 +148,7 @@ def run(
             help="Device string of the autopilot, /dev/ttyAMA0,921600 or udpout:host:14550 or tcp:host:5760.",
         ),
     ] = None,
+    view: View = "off",
     sets: Sets = None,
 ) -> None:
     """Estimate live: sensors in, poses to the autopilot, everything logged. Ctrl-C ends it.
@@ -158,7 +171,7 @@ def run(
     def say(line: str) -> None:
         err.print(f"[dim]{time.monotonic() - begin:8.1f}[/]  {escape(line)}")
 
-    live = LiveRun(config, folder, say)
+    live = LiveRun(config, folder, say, view=_shown(view))
     say(f"{config.site.name}: estimator {config.pipeline.estimator}, log {folder / 'raw.mcap'}")
     stop = threading.Event()
     _stop_on_signal(stop)
@@ -252,8 +265,8 @@ def replay(
     from companion.log import Log
     from companion.replay import config_of, write_outputs
     from companion.replay import replay as run_log
-    from companion.rerun_view import RerunView
     from companion.tables import accuracy_table, anchor_table, sensor_lines
+    from companion.view.files import RerunFiles
     from estimators import ESTIMATORS
 
     opened = Log(log)
@@ -268,11 +281,18 @@ def replay(
         _play(opened, config, names[0], speed)
         return
     folder = folder or Path("out") / log.stem
-    view = RerunView(config, names[0], folder / "replay.rrd")
+    view = RerunFiles(config, names, folder / "replay.rrd", opened.start_ns)
     begin = time.perf_counter()
     with progress(err) as shown:
         bar = shown.add_task(log.name, total=1.0)
-        result = run_log(opened, config, names, view.tick, lambda share: shown.update(bar, completed=share))
+        result = run_log(
+            opened,
+            config,
+            names,
+            view.tick,
+            lambda share: shown.update(bar, completed=share),
+            on_chunk=view.chunk,
+        )
         view.close()
         shown.update(bar, completed=1.0)
     took = time.perf_counter() - begin
@@ -358,6 +378,13 @@ def main() -> NoReturn:
         err.print("[red]error:[/]", escape(str(error)))
         sys.exit(EXIT_BAD_INPUT)
     sys.exit(0)
+
+
+def _shown(view: str) -> "Shown":
+    match view:
+        case "web" | "native" | "off":
+            return view
+    raise UserError(f"--view: {view!r} is none of web, native, off")
 
 
 def _scenario_path(name: str) -> Path:

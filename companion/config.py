@@ -3,6 +3,7 @@
 import tomllib
 from collections.abc import Mapping, Sequence
 from functools import cache
+from ipaddress import IPv4Address
 from pathlib import Path
 from typing import Annotated, Any, Self, TypeVar
 
@@ -12,6 +13,7 @@ from pydantic import (
     BaseModel,
     ConfigDict,
     Field,
+    IPvAnyAddress,
     ValidationError,
     ValidationInfo,
     create_model,
@@ -212,6 +214,28 @@ class HealthTable(Table):
     )
 
 
+class ViewTable(Table):
+    """What Rerun shows and keeps of a run."""
+
+    bind: IPvAnyAddress = Field(
+        IPv4Address("127.0.0.1"),
+        description="address at which --view web is served; 0.0.0.0 = to whoever can reach this computer",
+    )
+    web_port: int = Field(9090, ge=1, le=65535, description="port of the page")
+    data_port: int = Field(9876, ge=1, le=65535, description="port from which the page gets its data")
+    memory_mb: int = Field(
+        256, ge=16, le=65536, description="kept for pages opened late, the newest first to stay [MB]"
+    )
+    scan_points: int = Field(
+        400, ge=0, le=100_000, description="at most so many points of a scan are shown; the log has all"
+    )
+    record: bool = Field(False, description="whether a run writes .rrd files into its folder, too")
+    file_mb: float = Field(
+        100.0, gt=0, le=100_000, description="another .rrd file is begun when one is so large [MB]"
+    )
+    file_minutes: float = Field(30.0, gt=0, le=10_000, description="or holds so much of a run [min]")
+
+
 class Config(Table):
     """A whole configuration, as a run uses it."""
 
@@ -231,6 +255,7 @@ class Config(Table):
     relocation: Recovering.Config = Field(default_factory=Recovering.Config)
     health: HealthTable = Field(default_factory=HealthTable)
     mavlink: MavlinkTable = Field(default_factory=MavlinkTable)
+    view: ViewTable = Field(default_factory=ViewTable)
 
     @field_validator("anchors")
     @classmethod

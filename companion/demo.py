@@ -13,10 +13,10 @@ from companion.mavlink.session import MavlinkSession
 from companion.pipeline import Chain, Tick, make_pipeline
 from companion.plots import figure
 from companion.replay import Replay, config_of, replay, write_outputs
-from companion.rerun_view import RerunView
 from companion.sim.autopilot import EmulatedAutopilot
 from companion.sim.scenario import Scenario
 from companion.sim.simulate import START_NS, record
+from companion.view.files import RerunFiles
 
 ESTIMATORS_COMPARED = ("ekf", "least_squares", "lidar_odometry")
 
@@ -64,8 +64,8 @@ def run_demo(scenario: Scenario, folder: Path, progress: Progress) -> tuple[Repl
     config = config_of(log, [])
     names = [config.pipeline.estimator]
     names += [name for name in ESTIMATORS_COMPARED if name not in names]
-    view = RerunView(config, names[0], folder / "replay.rrd")
-    result = replay(log, config, names, view.tick, lambda share: progress("replay", share))
+    view = RerunFiles(config, names, folder / "replay.rrd", log.start_ns)
+    result = replay(log, config, names, view.tick, lambda share: progress("replay", share), view.chunk)
     progress("replay", 1.0)
     progress("pictures", 0.0)
     view.close()

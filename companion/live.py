@@ -24,6 +24,10 @@ from companion.mavlink.signing import SigningClock, read_key
 from companion.pipeline import Chain, Tick, make_pipeline
 from companion.range_log import HEADER, range_lines
 from companion.replay import tum_line
+from companion.view.drawing import Item
+from companion.view.line import Line
+from companion.view.live_view import LiveView
+from companion.view.viewer import Shown, check_viewer
 from drivers.discovery import Finder
 from drivers.inbox import Inbox
 from drivers.port import AutoAddress, Port, PortEvent, PortStatus, parse_address
@@ -74,17 +78,25 @@ class LiveRun:
         folder: gets `raw.mcap`, `config.toml`, `poses.tum` and `ranges.csv`.
         say: takes one line for the operator when a port or the health changes.
         watch: who else wants to hear the autopilot.
+        view: where the run is shown while it runs.
 
     Raises:
-        UserError: the folder cannot be written, or the MAVLink device string makes no sense.
+        UserError: the folder cannot be written, the MAVLink device string makes no sense, or the view
+            cannot be opened.
     """
 
     def __init__(
-        self, config: Config, folder: Path, say: Callable[[str], None], watch: Watch | None = None
+        self,
+        config: Config,
+        folder: Path,
+        say: Callable[[str], None],
+        watch: Watch | None = None,
+        view: Shown = "off",
     ) -> None:
         self._inbox = Inbox([*config.sensor, MAVLINK, GROUND])
         self.status = LiveStatus(dropped=self._inbox.dropped)
-        self._say = say
+        self._operator = say
+        self._view: LiveView | None = None
         self._drops_said, self._drops_due_ns = 0, 0
         self._anchors_said = ""
         # First what may refuse its settings, so that a wrong call leaves no folder behind.
@@ -102,6 +114,8 @@ class LiveRun:
         self._session = MavlinkSession(config, key, self._signing_clock, watch)
         start_ns = time.monotonic_ns()
         self._anchors_due_ns = start_ns + ANCHORS_PERIOD_NS
+        if view != "off":
+            check_viewer(view, config.view)
         self._log = LogWriter(folder / "raw.mcap", config.to_toml(), start_ns)
         try:
             (folder / "config.toml").write_text(config.to_toml(), encoding="utf-8")
@@ -112,7 +126,11 @@ class LiveRun:
             raise UserError(f"cannot write to {folder}: {error.strerror}") from error
         self._primary = config.pipeline.estimator
         self._period_ns = round(1e9 / config.pipeline.rate)
-        self._chain = Chain(config, start_ns, make_pipeline(config, [self._primary]), self._primary)
+        if view != "off" or config.view.record:
+            files = folder / "view.rrd" if config.view.record else None
+            self._view = LiveView(config, [self._primary], start_ns, view, files, say)
+        pipeline = make_pipeline(config, [self._primary])
+        self._chain = Chain(config, start_ns, pipeline, self._primary, watched=self._view is not None)
         self._ports = {name: self._make_port(name, table) for name, table in config.sensor.items()}
         self._open_sensors: set[str] = set()
         if warning := budget_warning(config):
@@ -157,6 +175,7 @@ class LiveRun:
         chunk = RawChunk(event.name, Direction.IN, event.stamp_ns, event.data)
         self._log.raw(chunk)
         if event.name in self._links:
+            self._show(chunk)
             self._session.receive(event.name, event.data, event.stamp_ns, time.monotonic_ns())
             self.status.autopilot = self._session.autopilot
             self._take_over_parameters()
@@ -176,6 +195,7 @@ class LiveRun:
 
     def _give_out(self, tick: Tick) -> None:
         pose = tick.poses[self._primary]
+        self._show(tick)
         if pose is not None:
             self._poses.write(tum_line(pose))
         for outcome in tick.outcomes:
@@ -183,7 +203,7 @@ class LiveRun:
                 self._ranges.write(range_lines(outcome.measurement, outcome.reports[self._primary]))
         self._say_anchors(tick.stamp_ns)
         if self.status.health is None or tick.health.state != self.status.health.state:
-            self._say(
+            self._operator(
                 f"health: {tick.health.state}" + (f" ({tick.health.reason})" * bool(tick.health.reason))
             )
         self.status.pose, self.status.health = pose, tick.health
@@ -205,7 +225,9 @@ class LiveRun:
         sent = set()
         for name, data in self._session.take().items():
             if name in self._links and self._links[name].write(data):
-                self._log.raw(RawChunk(name, Direction.OUT, time.monotonic_ns(), data))
+                chunk = RawChunk(name, Direction.OUT, time.monotonic_ns(), data)
+                self._log.raw(chunk)
+                self._show(chunk)
                 sent.add(name)
         return sent
 
@@ -222,6 +244,14 @@ class LiveRun:
                     save_setting(Path(self._parameter_file), line)
                 except UserError as error:
                     self._say(str(error))
+
+    def _say(self, line: str) -> None:
+        self._operator(line)
+        self._show(Line(time.monotonic_ns(), line))
+
+    def _show(self, item: Item) -> None:
+        if self._view is not None:
+            self._view.put(item)
 
     def _talk_to_devices(self) -> None:
         for name, sensor in self._chain.sensors.items():
@@ -258,3 +288,5 @@ class LiveRun:
         self._poses.close()
         self._ranges.close()
         self._log.close()
+        if self._view is not None:
+            self._view.close()

@@ -6,7 +6,7 @@ replay of the log asks for exactly the poses that the live run gave.
 """
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
@@ -21,7 +21,7 @@ from drivers import make_sensor
 from drivers.autopilot import Autopilot
 from drivers.framing import Sensor
 from estimators import make_estimator
-from estimators.base import Estimator, Report
+from estimators.base import Estimator, Report, Sketch, Sketched
 from estimators.lidar.fused_odometry import FusedOdometry
 from estimators.lidar.scan_matching import ScanMatcher
 from estimators.messages import LoopClosure, Measurement, PoseEstimate, PoseIncrement, RangeFrame, Scan
@@ -61,12 +61,14 @@ class Tick:
         outcomes: measurements processed since the tick before.
         poses: estimator name -> pose at `stamp_ns`, None while it has none.
         health: judgement of the primary estimator's pose.
+        sketches: estimator -> what it holds besides; empty unless somebody watches.
     """
 
     stamp_ns: int
     outcomes: list[Outcome]
     poses: dict[str, PoseEstimate | None]
     health: Health
+    sketches: dict[str, Sketch] = field(default_factory=dict)
 
 
 class Pipeline:
@@ -110,6 +112,11 @@ class Pipeline:
         """Each estimator's pose."""
         return {name: estimator.pose_at(stamp_ns) for name, estimator in self._estimators.items()}
 
+    def sketches(self) -> dict[str, Sketch]:
+        """What estimators hold besides their poses, of those that can show it."""
+        shown = {name: e.sketch() for name, e in self._estimators.items() if isinstance(e, Sketched)}
+        return {name: sketch for name, sketch in shown.items() if sketch is not None}
+
     def _update(self, measurement: Measurement) -> Outcome:
         return Outcome(
             measurement, {name: estimator.update(measurement) for name, estimator in self._estimators.items()}
@@ -124,14 +131,18 @@ class Chain:
         start_ns: time of the first tick.
         pipeline: front end and estimators.
         primary: name of the estimator whose pose is judged and sent.
+        watched: whether ticks hold the estimators' sketches.
     """
 
-    def __init__(self, config: Config, start_ns: int, pipeline: Pipeline, primary: str) -> None:
+    def __init__(
+        self, config: Config, start_ns: int, pipeline: Pipeline, primary: str, watched: bool = False
+    ) -> None:
         self.sensors = make_sensors(config)
         self._decoders: dict[str, Decoder] = {**self.sensors, **make_autopilot_input(config)}
         self.sequencer = Sequencer(round(config.pipeline.hold_ms * 1e6))
         self._pipeline = pipeline
         self._primary = primary
+        self._watched = watched
         self._monitor = make_monitor(config, self.sensors)
         self._range_biases = config.range_biases()
         self._start_ns = start_ns
@@ -175,7 +186,8 @@ class Chain:
                 self._monitor.observe(outcome.measurement, outcome.reports[self._primary])
                 outcomes.append(outcome)
         poses = self._pipeline.poses_at(stamp_ns)
-        return Tick(stamp_ns, outcomes, poses, self._monitor.judge(poses[self._primary], stamp_ns))
+        health = self._monitor.judge(poses[self._primary], stamp_ns)
+        return Tick(stamp_ns, outcomes, poses, health, self._pipeline.sketches() if self._watched else {})
 
 
 def make_sensors(config: Config) -> dict[str, Sensor]:

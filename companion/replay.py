@@ -14,11 +14,11 @@ from companion import __version__
 from companion.config import Config, config_from_toml
 from companion.errors import UserError
 from companion.evaluate import Accuracy, Errors, Reference, compare
-from companion.log import Log, Truth
+from companion.log import Log, RawChunk, Truth
 from companion.pipeline import Chain, FrontEnd, Pipeline, Tick, make_parts
 from companion.range_log import HEADER, range_lines
 from drivers.framing import DecodeStats
-from estimators.base import Estimator, Report, Verdict
+from estimators.base import Estimator, Report, Sketch, Sketched, Verdict
 from estimators.messages import Measurement, PoseEstimate, PoseIncrement, RangeFrame, Scan
 
 
@@ -59,6 +59,9 @@ class _TimedEstimator:
 
     def pose_at(self, stamp_ns: int) -> PoseEstimate | None:
         return self._estimator.pose_at(stamp_ns)
+
+    def sketch(self) -> Sketch | None:
+        return self._estimator.sketch() if isinstance(self._estimator, Sketched) else None
 
 
 class _TimedFrontEnd:
@@ -133,6 +136,8 @@ def replay(
     names: list[str],
     on_tick: Callable[[Tick, Truth | None], None] | None = None,
     on_progress: Callable[[float], None] | None = None,
+    on_chunk: Callable[[RawChunk], None] | None = None,
+    until_ns: int | None = None,
     close_loops: bool = False,
 ) -> Replay:
     """Run a log through the pipeline.
@@ -143,6 +148,8 @@ def replay(
         names: estimators to run side by side, the primary first.
         on_tick: called for every tick with the newest truth before it.
         on_progress: called now and then with the share of the log that is done.
+        on_chunk: called for every chunk before it is decoded; ticks then hold the estimators' sketches.
+        until_ns: end there.
         close_loops: look for loop closures although none of the estimators has a use for them.
 
     Raises:
@@ -155,7 +162,7 @@ def replay(
     result.anchor_verdicts = {name: defaultdict(Counter) for name in names}
     result.iterations = {name: [] for name in names}
     pipeline = _timed_pipeline(config, names, result.update_times, close_loops)
-    chain = Chain(config, begin_ns, pipeline, names[0])
+    chain = Chain(config, begin_ns, pipeline, names[0], watched=on_chunk is not None)
     truths: list[Truth] = []
     ticks_ns: list[int] = []
 
@@ -187,6 +194,10 @@ def replay(
         if isinstance(record, Truth):
             truths.append(record)
             continue
+        if until_ns is not None and record.stamp_ns > until_ns:
+            break
+        if on_chunk is not None:
+            on_chunk(record)
         fed += record.source in chain.sensors
         for tick in chain.feed(record):
             take(tick)

@@ -57,6 +57,7 @@ _NLOS = frozenset({Verdict.SUSPECT, Verdict.TOO_LONG, Verdict.WEAK_FIRST_PATH, V
 _USED = frozenset({Verdict.ACCEPTED, Verdict.DOWNWEIGHTED})
 
 _EMPTY = np.empty(0)
+_NO_POSES = np.empty((0, 3))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -152,6 +153,30 @@ class Estimator(Protocol):
 
     def pose_at(self, stamp_ns: int) -> PoseEstimate | None:
         """Pose at a time near the newest measurement, without changing the state; None when unknown."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sketch:
+    """What an estimator holds besides its pose, for pictures.
+
+    Attributes:
+        particles: (N, 3) x [m], y [m], yaw [rad] in the map; empty for an estimator without.
+        window: (M, 3) the same of the poses that are still being estimated.
+        keyframes: (K, 3) the same of those to which later scans are matched.
+    """
+
+    particles: FloatArray = field(default_factory=lambda: _NO_POSES)
+    window: FloatArray = field(default_factory=lambda: _NO_POSES)
+    keyframes: FloatArray = field(default_factory=lambda: _NO_POSES)
+
+
+@runtime_checkable
+class Sketched(Protocol):
+    """An estimator that can show what it holds."""
+
+    def sketch(self) -> Sketch | None:
+        """Copies of what it holds now; None when there is nothing to show."""
         ...
 
 

@@ -14,7 +14,7 @@ from typing import ClassVar, TypeAlias
 import numpy as np
 from pydantic import Field
 
-from estimators.base import Report, Setup, Verdict
+from estimators.base import Report, Setup, Sketch, Verdict
 from estimators.landmark_gate import LandmarkGate
 from estimators.lidar.keyframes import START_SPEED_SIGMA, KeyframeTracker
 from estimators.messages import (
@@ -87,6 +87,10 @@ class ParticleCloud(KeyframeTracker):
     def particles(self) -> tuple[FloatArray, FloatArray]:
         """Particles (N, 9) and weights (N,) at the newest measurement, for tests and pictures."""
         return self._particles.copy(), self._weights.copy()
+
+    def sketch(self) -> Sketch:
+        """The particles' poses at the newest measurement."""
+        return Sketch(particles=self._particles[:, POSE].copy())
 
     @property
     def gate(self) -> RangeGate:

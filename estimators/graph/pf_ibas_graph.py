@@ -1,6 +1,8 @@
 """The full method of huang2024: PF-IBAS poses each step and refuses blocked ranges, a graph follows."""
 
-from estimators.base import Report, Setup, Verdict
+from dataclasses import replace
+
+from estimators.base import Report, Setup, Sketch, Verdict
 from estimators.geometry import wrap_angle
 from estimators.graph.smoother import GraphSmoother
 from estimators.messages import FloatArray, LandmarkFrame, Measurement, RangeFrame
@@ -40,6 +42,10 @@ class PfIbasGraph(GraphSmoother):
         """Take one measurement, the filter first; what comes late the graph takes alone."""
         self._said = self._filter.update(measurement)
         return super().update(measurement)
+
+    def sketch(self) -> Sketch:
+        """The filter's particles and the graph's window."""
+        return replace(super().sketch(), particles=self._filter.sketch().particles)
 
     def _judge(self, frame: RangeFrame | LandmarkFrame, mean: FloatArray, cov: FloatArray) -> Report:
         if not isinstance(frame, RangeFrame) or Verdict.LATE in self._said.verdicts:

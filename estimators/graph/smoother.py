@@ -8,7 +8,7 @@ decided by its NIS against the state predicted to its instant. What comes late g
 import numpy as np
 from pydantic import Field
 
-from estimators.base import Report, Setup, Verdict
+from estimators.base import Report, Setup, Sketch, Verdict
 from estimators.graph import factors
 from estimators.graph.errors import GraphError
 from estimators.graph.jumps import is_jump
@@ -97,6 +97,15 @@ class GraphSmoother(KeyframeTracker):
             return None
         mean, cov = self._predicted(stamp_ns)
         return self._estimate(stamp_ns, mean[STATE], cov[STATE, STATE], self._heading_known)
+
+    def sketch(self) -> Sketch:
+        """The poses of the window, and which of them are keyframes."""
+        window = self._window
+        poses = np.array([window.graph.values[window.variable(i)] for i in range(len(window.stamps_ns))])
+        poses = poses.reshape(-1, 3)
+        return Sketch(
+            window=poses, keyframes=poses[np.isin(window.stamps_ns, list(self._keyframes.values()))]
+        )
 
     def _place(self, pose: FloatArray, cov: FloatArray) -> None:
         self._gate.reset()

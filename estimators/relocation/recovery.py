@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from estimators.base import Report, Settable, Setup, Verdict
+from estimators.base import Report, Settable, Setup, Sketch, Sketched, Verdict
 from estimators.geometry import compose, inverse
 from estimators.messages import FloatArray, Measurement, PoseEstimate, PoseIncrement, RangeFrame
 from estimators.range_gate import HorizontalRanges
@@ -107,6 +107,10 @@ class Recovering:
     def pose_at(self, stamp_ns: int) -> PoseEstimate | None:
         """Pose of the filter; None before the start is known."""
         return self._wrapped.pose_at(stamp_ns) if self._known else None
+
+    def sketch(self) -> Sketch | None:
+        """What the filter shows; nothing before the start is known."""
+        return self._wrapped.sketch() if self._known and isinstance(self._wrapped, Sketched) else None
 
     def _look_round(self, now_ns: int) -> None:
         """Search when it is time for it, and there is reason to."""

@@ -1,14 +1,18 @@
 """Latency of a live run: from the last byte of a sensor to the pose's byte on the way to the autopilot.
 
     python tools/bench/latency.py --seconds 30
+    python tools/bench/latency.py --views off web stalled --rounds 3
 
 Emulated sensors in a process of their own (scans at 10 Hz, ranges at 50 Hz) on pseudo-terminals, `companion
 run`'s loop in this one, a UDP autopilot. Times are those of the log, which stamps what is read and written.
+The second command compares a run without viewer, one with the web viewer and .rrd files, and one whose viewer
+is stopped (SIGSTOP) while it is measured; they take turns, so that what else the machine does hits all alike.
 """
 
 import argparse
 import os
 import resource
+import signal
 import socket
 import subprocess
 import sys
@@ -26,9 +30,11 @@ from companion.config import load_config, params_dir
 from companion.live import LiveRun
 from companion.log import Direction, Log, RawChunk
 from companion.mavlink.link import NAME
+from companion.view.viewer import free_port
 
 RANGE_RATE = 50
-WARM_UP = 8.0
+VIEWS = ("off", "web", "stalled")
+WARM_UP = 12.0
 """Until poses are sent and every piece of code has run [s]."""
 
 
@@ -38,19 +44,36 @@ def main() -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--seconds", type=float, default=30.0, help="measured after a warm-up (default 30)")
+    parser.add_argument(
+        "--views", nargs="+", choices=VIEWS, default=["off"], help="what watches (default off)"
+    )
+    parser.add_argument("--rounds", type=int, default=1, help="turns of each (default 1)")
     arguments = parser.parse_args()
-    with tempfile.TemporaryDirectory() as folder:
-        share = _run(Path(folder), arguments.seconds)
-        ages, waits, rate = _latencies(Path(folder) / "run" / "raw.mcap")
+    found: dict[str, list[tuple[float, list[float], list[float], float]]] = {v: [] for v in arguments.views}
+    for _ in range(arguments.rounds):
+        for view in arguments.views:
+            with tempfile.TemporaryDirectory() as folder:
+                share = _run(Path(folder), arguments.seconds, view)
+                found[view].append((share, *_latencies(Path(folder) / "run" / "raw.mcap")))
     out = Console(soft_wrap=True, highlight=False)
-    out.print(f"poses at {rate:.1f} Hz, {share:.0%} of one core")
-    for name, values in (("last sensor byte in to pose byte out", waits), ("age of a pose when sent", ages)):
-        median, high = np.quantile(values, [0.5, 0.99])
-        out.print(f"{name}: median {median:.1f} ms, p99 {high:.1f} ms, max {max(values):.1f} ms")
+    for view, turns in found.items():
+        shares, ages, waits, rates = zip(*turns, strict=True)
+        out.print(f"view {view}: poses at {np.mean(rates):.1f} Hz, {np.mean(shares):.0%} of one core")
+        for name, each in (
+            ("last sensor byte in to pose byte out", waits),
+            ("age of a pose when sent", ages),
+        ):
+            values = np.concatenate(each)
+            median, high = np.quantile(values, [0.5, 0.99])
+            by_turn = ", ".join(f"{np.quantile(turn, 0.99):.1f}" for turn in each)
+            out.print(
+                f"  {name}: median {median:.2f} ms, p99 {high:.2f} ms (by turn {by_turn}), "
+                f"max {values.max():.1f} ms"
+            )
     return 0
 
 
-def _run(folder: Path, seconds: float) -> float:
+def _run(folder: Path, seconds: float, view: str) -> float:
     """Leave a log; gives the share of one core that the run took after its warm-up."""
     scenario = folder / "fast.toml"
     base = (params_dir() / "scenarios" / "square_room.toml").read_text(encoding="utf-8")
@@ -71,8 +94,10 @@ def _run(folder: Path, seconds: float) -> float:
         ports = dict(emulate.stdout.readline().split() for _ in range(2))
         sets = [f"sensor.{name}.port={path}" for name, path in ports.items()]
         url = f"mavlink.url=udpout:127.0.0.1:{autopilot.getsockname()[1]}"
+        sets += [f"view.data_port={free_port()}", f"view.web_port={free_port()}"]
+        sets += ["view.record=true"] if view != "off" else []
         config = load_config(params_dir() / "sites" / "demo_room.toml", [*sets, url])
-        live = LiveRun(config, folder / "run", lambda _: None)
+        live = LiveRun(config, folder / "run", lambda _: None, view="off" if view == "off" else "web")
         threads = [
             threading.Thread(target=live.run, args=(stop,)),
             threading.Thread(target=_answer, args=(autopilot, stop)),
@@ -80,6 +105,9 @@ def _run(folder: Path, seconds: float) -> float:
         for thread in threads:
             thread.start()
         time.sleep(WARM_UP)
+        if view == "stalled":
+            for process in _viewers():
+                os.kill(process, signal.SIGSTOP)
         begin, used = time.monotonic(), _cpu()
         time.sleep(seconds)
         share = (_cpu() - used) / (time.monotonic() - begin)
@@ -90,6 +118,22 @@ def _run(folder: Path, seconds: float) -> float:
     emulate.wait()
     emulate.stdout.close()
     return share
+
+
+def _viewers() -> list[int]:
+    """Rerun's own processes that descend from this one."""
+    known = {}
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        name, _, rest = stat.read_text(encoding="utf-8").partition(") ")
+        known[int(stat.parent.name)] = int(rest.split()[1]), name.partition("(")[2]
+    found = []
+    for process, (parent, name) in known.items():
+        while parent > 1 and parent != os.getpid():
+            parent = known.get(parent, (0, ""))[0]
+        if parent == os.getpid() and name == "rerun":
+            found.append(process)
+    assert found, "no viewer to stop"
+    return found
 
 
 def _answer(autopilot: socket.socket, stop: threading.Event) -> None:

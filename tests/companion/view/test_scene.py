@@ -16,8 +16,8 @@ from companion.errors import UserError
 from companion.log import Log, Truth
 from companion.pipeline import Tick
 from companion.replay import config_of, replay
-from companion.rerun_view import RerunView
 from companion.sim.world import World
+from companion.view.files import RerunFiles
 from estimators.base import Verdict
 from estimators.messages import FloatArray, RangeFrame, Scan
 
@@ -50,7 +50,8 @@ class Run:
         primary: str = "ekf",
         change: Callable[[int, Tick, Truth | None], tuple[Tick, Truth | None]] = lambda _, *both: both,
     ) -> Recording:
-        view = RerunView(self.config, primary, path)
+        names = [primary, *(name for name in NAMES if name != primary)]
+        view = RerunFiles(self.config, names, path, self.ticks[0][0].stamp_ns)
         for i, (tick, truth) in enumerate(self.ticks):
             view.tick(*change(i, tick, truth))
         view.close()
@@ -58,11 +59,12 @@ class Run:
 
 
 def read(path: Path) -> Recording:
-    """Entity -> component -> rows; a static component has one row."""
+    """Entity -> component -> rows of all batches; a static component has one row."""
     entities: Recording = {}
     for chunk in RrdReader(path).stream().to_chunks():
-        columns = chunk.to_record_batch().to_pydict()
-        entities.setdefault(chunk.entity_path.removeprefix("/"), {}).update(columns)
+        entity = entities.setdefault(chunk.entity_path.removeprefix("/"), {})
+        for name, rows in chunk.to_record_batch().to_pydict().items():
+            entity.setdefault(name, []).extend(rows)
     return entities
 
 
@@ -93,7 +95,6 @@ def test_time_begins_with_the_log(run: Run, recording: Recording) -> None:
 
 def test_map_holds_map_coordinates_and_only_its_transform_is_mirrored(run: Run, recording: Recording) -> None:
     assert recording["map"]["Transform3D:scale"] == [[[1.0, -1.0, 1.0]]]
-    assert recording["map/anchors"]["Points2D:labels"] == [["A0", "A1", "A2", "A3"]]
     (anchors,) = recording["map/anchors"]["Points2D:positions"]
     assert np.array(anchors) == pytest.approx(np.array([a[:2] for a in run.config.anchors.values()]))
     (walls,) = recording["map/walls"]["LineStrips2D:strips"]
@@ -150,7 +151,8 @@ def test_plots_hold_errors_residuals_nis_and_gate(run: Run, recording: Recording
     assert "error/yaw/least_squares" not in recording  # it has no heading
     for anchor in run.config.anchors:
         assert len(recording[f"ranges/residual/A{anchor}"]["Scalars:scalars"]) > 100
-    ((gate,), _) = recording["ranges/nis/gate"]["Scalars:scalars"]
+    ((gate,), *others) = recording["ranges/nis/gate"]["Scalars:scalars"]
+    assert all(other == [gate] for other in others)
     nis = [v for i in run.config.anchors for (v,) in recording[f"ranges/nis/A{i}"]["Scalars:scalars"]]
     accepted = run.verdicts("ekf").count(Verdict.ACCEPTED)
     assert accepted <= sum(value <= gate for value in nis) < len(nis)
@@ -178,7 +180,8 @@ def test_health_changes_are_a_state_and_a_line_of_text(run: Run, recording: Reco
     states = [tick.health.state for tick, _ in run.ticks]
     changes = [b for a, b in zip([None, *states], states, strict=False) if a is not b]
     assert [state for (state,) in recording["health/state"]["StateChange:state"]] == changes
-    assert [text.split(":")[0] for (text,) in recording["health/log"]["TextLog:text"]] == changes
+    texts = [text for (text,) in recording["log"]["TextLog:text"]]
+    assert [text.split()[3].rstrip(":") for text in texts if " s  health " in text] == changes
 
 
 def test_the_file_says_how_it_opens(run: Run, tmp_path: Path) -> None:
@@ -241,23 +244,23 @@ def test_estimators_without_heading_or_ranges_can_be_primary(run: Run, tmp_path:
 
 
 def test_a_run_of_no_ticks_is_an_empty_map(config: Config, tmp_path: Path) -> None:
-    RerunView(config, "ekf", tmp_path / "run.rrd").close()
+    RerunFiles(config, ["ekf"], tmp_path / "run.rrd", 0).close()
     assert "map/walls" in read(tmp_path / "run.rrd")
 
 
 def test_a_file_that_cannot_be_written_is_the_users_error(config: Config, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(UserError, match=r"cannot write the view .*run\.rrd: File exists"):
-        RerunView(config, "ekf", tmp_path / "file" / "run.rrd")
+        RerunFiles(config, ["ekf"], tmp_path / "file" / "run.rrd", 0)
     with pytest.raises(UserError, match="Is a directory"):
-        RerunView(config, "ekf", tmp_path)
+        RerunFiles(config, ["ekf"], tmp_path, 0)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="needs /dev/full and a limit on the size of files")
 def test_a_full_disk_is_the_users_error(run: Run, tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"cannot write the view /dev/full: .*No space left on device"):
-        RerunView(run.config, "ekf", Path("/dev/full"))
-    view = RerunView(run.config, "ekf", tmp_path / "run.rrd")
+        RerunFiles(run.config, NAMES, Path("/dev/full"), 0)
+    view = RerunFiles(run.config, NAMES, tmp_path / "run.rrd", 0)
     for tick, truth in run.ticks:
         view.tick(tick, truth)
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)

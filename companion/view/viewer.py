@@ -1,0 +1,145 @@
+"""Rerun's own viewer as a process beside ours: in a window, or as a page for a browser."""
+
+import os
+import socket
+import subprocess
+import sys
+import time
+from typing import Literal
+
+from companion.config import ViewTable
+from companion.errors import UserError
+
+Mode = Literal["web", "native"]
+Shown = Literal["web", "native", "off"]
+READY_WITHIN = 20.0
+"""A viewer that does not listen so long [s] after its start will not come."""
+_NICE = 10
+"""Whatever else this computer has to do comes before pictures."""
+
+
+class Viewer:
+    """A viewer that waits for data.
+
+    Args:
+        mode: "web" serves a page and its data at `view.bind`; "native" opens a window on this computer.
+        table: addresses and limits.
+
+    Raises:
+        UserError: no screen for a window, or a port is in use.
+    """
+
+    def __init__(self, mode: Mode, table: ViewTable) -> None:
+        self._mode, self._bind = mode, _address(mode, table)
+        check_viewer(mode, table)
+        self._data_port, self._web_port = table.data_port, table.web_port
+        limit = f"{table.memory_mb}MB"
+        options = ["--bind", self._bind, "--port", str(table.data_port), "--server-memory-limit", limit]
+        if mode == "web":
+            options += ["--serve-web", "--web-viewer-port", str(table.web_port)]
+            if not table.bind.is_loopback:
+                # The page comes from this computer under whatever name the browser has for it.
+                options += ["--cors-allow-origin", f"http://*:{table.web_port}"]
+        else:
+            options += ["--expect-data-soon"]
+        self._process = subprocess.Popen(  # noqa: S603  # our own interpreter, checked settings
+            [sys.executable, "-m", "rerun_cli", *options],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            env={**os.environ, "RERUN_APP_ONLY": "true"},
+            # Ctrl-C in the terminal is meant for the run, which then ends the viewer.
+            start_new_session=True,
+        )
+        os.setpriority(os.PRIO_PROCESS, self._process.pid, _NICE)
+
+    @property
+    def url(self) -> str:
+        """Where data is to be sent."""
+        return f"rerun+http://{_host(self._bind)}:{self._data_port}/proxy"
+
+    @property
+    def page(self) -> str:
+        """What to open in a browser; empty for a window."""
+        if self._mode == "native":
+            return ""
+        host = _host(self._bind)
+        return f"http://{host}:{self._web_port}/?url=rerun%2Bhttp%3A%2F%2F{host}%3A{self._data_port}%2Fproxy"
+
+    @property
+    def is_page(self) -> bool:
+        """Whether it is a page for a browser, not a window."""
+        return self._mode == "web"
+
+    @property
+    def is_running(self) -> bool:
+        """False once it was closed, or died."""
+        return self._process.poll() is None
+
+    def wait_until_ready(self) -> None:
+        """Wait until it listens.
+
+        Raises:
+            UserError: it ended, or does not listen in time.
+        """
+        end = time.monotonic() + READY_WITHIN
+        while time.monotonic() < end and self.is_running:
+            with socket.socket() as probe:
+                probe.settimeout(1.0)
+                if probe.connect_ex((_host(self._bind), self._data_port)) == 0:
+                    return
+            time.sleep(0.05)
+        self.kill()
+        raise UserError("rerun: the viewer does not start; try: python -m rerun_cli --version")
+
+    def kill(self) -> None:
+        """End it at once, whatever state it is in."""
+        # It is a process behind a process of Python, both in a session of their own.
+        if self.is_running:
+            os.killpg(self._process.pid, 9)
+        self._process.wait()
+
+
+def check_viewer(mode: Mode, table: ViewTable) -> None:
+    """Whether a viewer can be started.
+
+    Raises:
+        UserError: no screen for a window, or a port is in use.
+    """
+    if mode == "native" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise UserError("--view native: this computer has no screen (DISPLAY is not set); use --view web")
+    _check_port(_address(mode, table), table.data_port, "view.data_port")
+    if mode == "web":
+        _check_port(_address(mode, table), table.web_port, "view.web_port")
+
+
+def free_port() -> int:
+    """A port of the loopback interface that nobody listens on."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def _address(mode: Mode, table: ViewTable) -> str:
+    """Where it listens; a window needs nothing from other computers."""
+    return str(table.bind) if mode == "web" else "127.0.0.1"
+
+
+def _check_port(address: str, port: int, key: str) -> None:
+    family = socket.AF_INET6 if ":" in address else socket.AF_INET
+    with socket.socket(family) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((address, port))
+        except OSError as error:
+            raise UserError(
+                f"{key}: cannot listen at {address}:{port}: {error.strerror}; "
+                f"choose another with --set {key}=PORT"
+            ) from error
+
+
+def _host(address: str) -> str:
+    """An address to reach this computer at, for one to listen at."""
+    if address in ("0.0.0.0", "::"):  # noqa: S104
+        return socket.gethostname() if address == "0.0.0.0" else "[::1]"  # noqa: S104
+    return f"[{address}]" if ":" in address else address
