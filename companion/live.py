@@ -172,7 +172,8 @@ class LiveRun:
             if event.name in self._chain.sensors:
                 self._set_open(event)
             return
-        chunk = RawChunk(event.name, Direction.IN, event.stamp_ns, event.data)
+        stamp_ns = self._chain.stamp_to_log(event.stamp_ns)
+        chunk = RawChunk(event.name, Direction.IN, stamp_ns, event.data)
         self._log.raw(chunk)
         if event.name in self._links:
             self._show(chunk)

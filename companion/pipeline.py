@@ -158,11 +158,25 @@ class Chain:
         """What became lately of each anchor's ranges, by the primary estimator."""
         return self._monitor.anchors(now_ns)
 
+    def stamp_to_log(self, arrival_ns: int) -> int:
+        """Stamp of bytes that are only taken now: not before the last tick, which was given without them.
+
+        On a busy machine bytes may wait for longer than `pipeline.hold_ms`. A replay of the log must not have
+        them any earlier.
+        """
+        return max(arrival_ns, self._start_ns + round((self._ticks - 1) * self._period_ns))
+
     def feed(self, chunk: RawChunk) -> Iterator[Tick]:
-        """Give the ticks that were due before these bytes arrived, then decode the bytes."""
+        """Give the ticks that were due before these bytes arrived, then decode the bytes.
+
+        What went out says nothing: a loop that is behind writes for one tick when the next are due, too, and
+        takes what has arrived before it gives them.
+        """
+        if chunk.direction is Direction.OUT:
+            return
         yield from self.advance(chunk.stamp_ns)
         decoder = self._decoders.get(chunk.source)
-        if decoder is not None and chunk.direction is Direction.IN:
+        if decoder is not None:
             for measurement in decoder.feed(chunk.data, chunk.stamp_ns):
                 # Here once, so that logs stay as measured and replay takes off what it is told to.
                 if isinstance(measurement, RangeFrame):

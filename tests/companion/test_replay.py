@@ -1,6 +1,7 @@
 """Replay of simulated logs: the figures that the demo shows, and that a replay repeats itself."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from evo.tools import file_interface
 from companion.config import Config
 from companion.errors import UserError
 from companion.log import Direction, Log, LogWriter, RawChunk, Truth
+from companion.pipeline import Chain, Tick, make_pipeline
 from companion.replay import Replay, config_of, replay, write_outputs
 from companion.sim.scenario import load_scenario
 from tests.conftest import SCENARIO, write_log
@@ -68,6 +70,34 @@ def test_the_same_log_twice_gives_the_same_bytes(short_log: Path, tmp_path: Path
     for name in [*files, "config.toml"]:
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
     assert len((tmp_path / "a" / "poses.tum").read_text().splitlines()) > 300
+
+
+def test_bytes_that_a_busy_machine_takes_late_are_replayed_as_late(short_log: Path) -> None:
+    log = Log(short_log)
+    config = config_of(log, [])
+
+    def chain() -> Chain:
+        return Chain(config, log.start_ns, make_pipeline(config, ["ekf"]), "ekf")
+
+    def told(ticks: Iterable[Tick]) -> list[tuple[int, bytes]]:
+        poses = [(tick.stamp_ns, tick.poses["ekf"]) for tick in ticks]
+        return [(stamp_ns, pose.T_map_body.tobytes()) for stamp_ns, pose in poses if pose is not None]
+
+    rng = np.random.default_rng(1)
+    live, logged, lived = chain(), [], []
+    arrived = [chunk for chunk in log if isinstance(chunk, RawChunk)]
+    for chunk in (c for c in arrived if c.stamp_ns < log.start_ns + 5_000_000_000):
+        if rng.random() < 0.05:
+            # The loop's turn comes late, and once more before these bytes are handed over.
+            lived += told(live.advance(chunk.stamp_ns + 80_000_000))
+            logged.append(RawChunk("mavlink", Direction.OUT, chunk.stamp_ns + 160_000_000, b""))
+        logged.append(replace(chunk, stamp_ns=live.stamp_to_log(chunk.stamp_ns)))
+        lived += told(live.feed(logged[-1]))
+    again = chain()
+    replayed = [pose for chunk in logged for pose in told(again.feed(chunk))]
+    assert len(lived) > 100
+    assert replayed == lived[: len(replayed)]
+    assert len(lived) - len(replayed) < 4
 
 
 def test_other_estimators_beside_it_change_nothing(short_log: Path, tmp_path: Path) -> None:
