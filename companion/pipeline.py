@@ -21,7 +21,7 @@ from drivers.autopilot import Autopilot
 from drivers.framing import Sensor
 from estimators import make_estimator
 from estimators.base import Estimator, Report
-from estimators.lidar.scan_matching import ScanMatcher
+from estimators.lidar.front_ends import ScanFrontEnd, make_scan_front_end
 from estimators.messages import Measurement, PoseEstimate, PoseIncrement, RangeFrame, Scan
 
 
@@ -183,9 +183,10 @@ def make_parts(config: Config, names: list[str]) -> tuple[FrontEnd, dict[str, Es
     }
 
 
-def make_front_end(config: Config) -> FrontEnd:
+def make_front_end(config: Config) -> ScanFrontEnd:
     """What turns the site's scans into increments."""
-    return ScanMatcher(config.scan_matcher, config.lidar_mounting(), config.scan_preparation)
+    name, mounting = config.pipeline.front_end, config.lidar_mounting()
+    return make_scan_front_end(name, config.front_end_config(), mounting, config.scan_preparation)
 
 
 def make_pipeline(config: Config, names: list[str]) -> Pipeline:

@@ -84,7 +84,7 @@ class Replay:
         names: estimators, the primary first.
         poses: estimator -> its poses, one per tick at which it had one.
         errors: estimator -> errors against the log's truth; empty without truth.
-        update_times: estimator (and `scan_matcher`) -> time of its updates.
+        update_times: estimator (and `front_end`) -> time of its updates.
         verdicts: estimator -> how often each verdict was given to a range or increment.
         anchor_verdicts: estimator -> anchor -> the same of its ranges.
         range_lines: lines of `ranges.csv`, of the primary.
@@ -145,7 +145,7 @@ def replay(
     """
     begin_ns = last_ns = log.start_ns
     result = Replay(config, names, {name: [] for name in names})
-    result.update_times = {name: Stopwatch() for name in ["scan_matcher", *names]}
+    result.update_times = {name: Stopwatch() for name in ["front_end", *names]}
     result.verdicts = {name: Counter() for name in names}
     result.anchor_verdicts = {name: defaultdict(Counter) for name in names}
     chain = Chain(config, begin_ns, _timed_pipeline(config, names, result.update_times), names[0])
@@ -243,7 +243,7 @@ def summary(result: Replay) -> dict[str, object]:
         "complete": result.complete,
         "primary": result.names[0],
         "estimators": estimators,
-        "scan_matcher_ms": result.update_times["scan_matcher"].mean_ms,
+        "front_end_ms": result.update_times["front_end"].mean_ms,
         "health_ticks": dict(result.health),
         "late_measurements": result.late,
         "sensors": {name: asdict(stats) for name, stats in result.sensors.items()},
@@ -253,6 +253,6 @@ def summary(result: Replay) -> dict[str, object]:
 def _timed_pipeline(config: Config, names: list[str], update_times: dict[str, Stopwatch]) -> Pipeline:
     front_end, estimators = make_parts(config, names)
     return Pipeline(
-        _TimedFrontEnd(front_end, update_times["scan_matcher"]),
+        _TimedFrontEnd(front_end, update_times["front_end"]),
         {name: _TimedEstimator(estimator, update_times[name]) for name, estimator in estimators.items()},
     )

@@ -14,7 +14,7 @@ from estimators.lidar.feature_map import FeatureMap, Kind
 from estimators.lidar.features import Features, find_features
 from estimators.lidar.scan_fit import LEAST_INFORMATION
 from estimators.lidar.scan_preparation import PreparedScan, ScanPreparation
-from estimators.lidar.sightings import NO_ROWS, NOW, STATES, Rows, SpotSightings, WallSightings
+from estimators.lidar.sightings import STATES, SpotSightings, WallSightings
 from estimators.messages import FloatArray, IntArray, Measurement, PoseIncrement, Scan
 from estimators.models.motion import constant_velocity, cubic_between, smooth_motion
 
@@ -276,7 +276,7 @@ class _Look:
                 along = np.cos(theta) * off[:, 1] - np.sin(theta) * off[:, 0]
                 np.minimum.at(here.extents[:, 0], feature, along + walls.low[which])
                 np.maximum.at(here.extents[:, 1], feature, along + walls.high[which])
-        gone = set()
+        gone: set[int] = set()
         for first, second in matches[Kind.WALL].doubles:
             if not gone & {first, second} and are_one_wall(here, first, second):
                 kept, other = sorted((first, second), key=lambda i: -here.sightings[i])

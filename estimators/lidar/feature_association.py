@@ -77,7 +77,7 @@ def match_walls(here: FeatureMap, walls: Walls, sightings: WallSightings) -> Mat
 
 
 def match_spots(here: FeatureMap, kind: Kind, sightings: SpotSightings) -> Matches:
-    """Corners or poles of the map that those of a scan can be; the scan is deskewed by the predicted states."""
+    """Corners or poles of the map that those of a scan, deskewed by the predicted states, can be."""
     known = np.flatnonzero(here.kinds == kind)
     count = len(sightings.points)
     own = sightings.rows(here.states, np.zeros(count, dtype=np.int64), np.zeros((count, 2)))

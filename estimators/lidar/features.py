@@ -66,6 +66,19 @@ class Walls:
     noise: FloatArray
 
 
+NO_WALLS = Walls(
+    points=np.zeros(0, dtype=np.int64),
+    begin=np.zeros(0, dtype=np.int64),
+    size=np.zeros(0, dtype=np.int64),
+    centre=np.zeros((0, 2)),
+    angle=np.zeros(0),
+    low=np.zeros(0),
+    high=np.zeros(0),
+    lever=np.zeros(0),
+    noise=np.zeros((0, 2)),
+)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Spots:
     """Corners or poles, K of them.
@@ -117,8 +130,8 @@ def find_features(points: FloatArray, origins: FloatArray, range_sigma: float) -
     whole = steps <= HOLE * usual
     apart = ~whole | (gaps > nearer * steps / np.sin(STEEPEST) + 5.0 * range_sigma)
     cuts = np.flatnonzero(apart) + 1
-    spans = _split(points, np.concatenate([[0], cuts, [len(points)]]), SPLIT_SIGMAS * range_sigma)
-    walls, spans = _walls(points, beams, spans, range_sigma)
+    straight = _split(points, np.concatenate([[0], cuts, [len(points)]]), SPLIT_SIGMAS * range_sigma)
+    walls, spans = _walls(points, beams, straight, range_sigma)
     # Beyond the ends of the scan there is a hole.
     open_after = np.append(whole & (np.diff(ranges) > LEAST_STEP), False)
     open_before = np.concatenate([[False], whole & (np.diff(ranges) < -LEAST_STEP)])
@@ -162,13 +175,11 @@ def _walls(
     chosen = np.arange(len(own)) - begin[own] + spans[own, 0] + 1
 
     def mean(values: FloatArray) -> FloatArray:
-        sums: FloatArray = np.add.reduceat(values, begin, axis=0) if len(begin) else np.zeros((0,))
+        sums: FloatArray = np.add.reduceat(values, begin, axis=0)
         return (sums.T / size).T
 
     if not len(spans):
-        nothing = np.zeros(0)
-        none = np.zeros(0, dtype=np.int64)
-        return Walls(none, none, none, nothing.reshape(0, 2), *[nothing] * 4, nothing.reshape(0, 2)), spans
+        return NO_WALLS, spans
     centre = mean(points[chosen])
     x, y = (points[chosen] - centre[own]).T
     xx, xy, yy = mean(x * x), mean(x * y), mean(y * y)
@@ -181,7 +192,7 @@ def _walls(
     u, off = c * x + s * y, s * x - c * y
     spread, scatter = mean(u * u), mean(off * off)
     # A bow is what is square to an offset and to a slope.
-    bow = u * u - (spread + 0.0)[own]
+    bow = u * u - spread[own]
     bow -= u * (mean(bow * u) / spread)[own]
     bent = np.abs(mean(bow * off)) * np.sqrt(size / (mean(bow * bow) * np.maximum(scatter, range_sigma**2)))
     square = s * beams[chosen, 0] - c * beams[chosen, 1]
