@@ -5,11 +5,13 @@ is taken from where the body is at the beam's own instant, as in scan matching. 
 say: the motion model's share is taken out again, and a direction that no feature holds comes out wide.
 """
 
+from dataclasses import replace
+
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from estimators.geometry import inverse, transform, transform_each
-from estimators.lidar.feature_association import NEW, NONE, Matches, are_one_wall, match_spots, match_walls
+from estimators.lidar.feature_association import NEW, NONE, Matches, match_spots, match_walls, unite_doubles
 from estimators.lidar.feature_map import FeatureMap, Kind
 from estimators.lidar.features import Features, find_features
 from estimators.lidar.scan_fit import LEAST_INFORMATION
@@ -163,7 +165,7 @@ class EkfSlam:
             self._map = None
             return self._begin(scan)
         look.correct(here, matches)
-        increment, cov = _said_by_scan(predicted, expected, here.pose, here.pose_cov)
+        increment, cov = _said_by_scan(predicted, expected, here.pose.copy(), here.pose_cov)
         velocity = here.states[9:]
         cov += (1e-3 * config.stamp_sigma_ms) ** 2 * np.outer(velocity, velocity)
         look.note(here, matches)
@@ -218,26 +220,29 @@ class _Look:
         """As if the map knew none of the features."""
         counts = {Kind.WALL: len(self._walls.size)}
         counts |= {kind: len(spots.points) for kind, spots in self._spots.items()}
-        return {kind: Matches(np.full(count, NEW), []) for kind, count in counts.items()}
+        return {
+            kind: Matches(np.full(count, NEW), np.zeros(count, bool), []) for kind, count in counts.items()
+        }
 
     def match(self, here: FeatureMap) -> dict[Kind, Matches]:
         """Hold every sighting against the map."""
-        found = {Kind.WALL: match_walls(here, self._found.walls, self._walls)}
+        walls = match_walls(here, self._found.walls, self._walls)
+        if unite_doubles(here, walls.doubles):
+            walls = match_walls(here, self._found.walls, self._walls)
+        found = {Kind.WALL: walls}
         for kind, spots in self._spots.items():
             matches = match_spots(here, kind, spots)
             # A wall may be seen in parts, but no corner or pole twice.
             times = np.bincount(matches.feature[matches.feature >= 0], minlength=len(here.kinds))
             twice = (matches.feature >= 0) & (times[matches.feature] > 1)
-            found[kind] = Matches(np.where(twice, NONE, matches.feature), [])
+            found[kind] = replace(matches, feature=np.where(twice, NONE, matches.feature))
         return found
 
     def known_share(self, matches: dict[Kind, Matches]) -> float:
         """Share of the points on walls that are of known walls; of spots where there are no walls."""
         if len(self._walls.size):
-            known = matches[Kind.WALL].feature >= 0
-            return float(self._walls.size[known].sum() / self._walls.size.sum())
-        features = np.concatenate([matches[kind].feature for kind in self._spots])
-        return float((features >= 0).mean())
+            return float(self._walls.size[matches[Kind.WALL].known].sum() / self._walls.size.sum())
+        return float(np.concatenate([matches[kind].known for kind in self._spots]).mean())
 
     def correct(self, here: FeatureMap, matches: dict[Kind, Matches]) -> None:
         """Stages 2 and 3: iterated update with all sightings of known features."""
@@ -265,7 +270,7 @@ class _Look:
         here.wrap()
 
     def note(self, here: FeatureMap, matches: dict[Kind, Matches]) -> None:
-        """Remember what was seen of known features, and make one what are one wall."""
+        """Remember what was seen of known features."""
         for kind, of_kind in matches.items():
             which, feature = _known(of_kind)
             here.unseen[feature] = 0
@@ -276,14 +281,6 @@ class _Look:
                 along = np.cos(theta) * off[:, 1] - np.sin(theta) * off[:, 0]
                 np.minimum.at(here.extents[:, 0], feature, along + walls.low[which])
                 np.maximum.at(here.extents[:, 1], feature, along + walls.high[which])
-        gone: set[int] = set()
-        for first, second in matches[Kind.WALL].doubles:
-            if not gone & {first, second} and are_one_wall(here, first, second):
-                kept, other = sorted((first, second), key=lambda i: -here.sightings[i])
-                here.unite(kept, other)
-                gone.add(other)
-        if gone:
-            here.keep(np.setdiff1d(np.arange(len(here.kinds)), list(gone)))
 
     def augment(self, here: FeatureMap, matches: dict[Kind, Matches]) -> None:
         """Stage 4: put what is new into the map."""
@@ -343,7 +340,7 @@ def _said_by_scan(
     least = np.linalg.inv(expected + np.eye(3) / LEAST_INFORMATION)
     said = np.linalg.inv(known - np.linalg.inv(expected) + least)
     said = 0.5 * (said + said.T)
-    return predicted + said @ known @ (pose - predicted), said
+    return pose, said
 
 
 def _forget(here: FeatureMap, most: int) -> None:

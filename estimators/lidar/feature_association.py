@@ -38,10 +38,12 @@ class Matches:
 
     Attributes:
         feature: (K,) the feature of each, `NEW` or `NONE`.
+        known: (K,) whether it can be of any feature.
         doubles: pairs of features between which a sighting could not tell.
     """
 
     feature: IntArray
+    known: NDArray[np.bool_]
     doubles: list[tuple[int, int]]
 
 
@@ -88,6 +90,19 @@ def match_spots(here: FeatureMap, kind: Kind, sightings: SpotSightings) -> Match
     residual = np.einsum("pij,pj->pi", axes[sighting], off[sighting, feature])
     distance = _distances(here, own, residual, -axes[sighting], sighting, known[feature])
     return _unambiguous(count, sighting, known[feature], distance)
+
+
+def unite_doubles(here: FeatureMap, doubles: list[tuple[int, int]]) -> bool:
+    """Make one of every two walls that cannot be told apart; whether there were any."""
+    gone: set[int] = set()
+    for pair in doubles:
+        if not gone & set(pair) and are_one_wall(here, *pair):
+            kept, other = sorted(pair, key=lambda i: -here.sightings[i])
+            here.unite(kept, other)
+            gone.add(other)
+    if gone:
+        here.keep(np.setdiff1d(np.arange(len(here.kinds)), sorted(gone)))
+    return bool(gone)
 
 
 def are_one_wall(here: FeatureMap, first: int, second: int) -> bool:
@@ -143,7 +158,8 @@ def _unambiguous(count: int, sighting: IntArray, feature: IntArray, distance: Fl
     found[sighting[distance < NEW_GATE]] = NONE
     inside: NDArray[np.bool_] = distance < GATE
     sighting, feature = sighting[inside], feature[inside]
-    alone = np.bincount(sighting, minlength=count)[sighting] == 1
+    candidates = np.bincount(sighting, minlength=count)
+    alone = candidates[sighting] == 1
     found[sighting[alone]] = feature[alone]
     doubles = {
         (int(a), int(b))
@@ -151,4 +167,4 @@ def _unambiguous(count: int, sighting: IntArray, feature: IntArray, distance: Fl
         for a, *others in [np.sort(feature[sighting == i])]
         for b in others
     }
-    return Matches(found, sorted(doubles))
+    return Matches(found, candidates > 0, sorted(doubles))

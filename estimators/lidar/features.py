@@ -15,9 +15,12 @@ from estimators.messages import FloatArray, IntArray
 
 STEEPEST = np.deg2rad(10.0)
 """Neighbouring points are of one surface when a wall that a beam meets at this angle could hold both."""
-SPLIT_SIGMAS = 4.0
-"""A run is split where a point is further from its chord than so many standard deviations of a range."""
-LEAST_WALL_POINTS = 8
+SPLIT_SIGMAS = 3.0
+"""A run is split where it is further from its chord than so many standard deviations of a range."""
+SMOOTHED = 2
+"""... in the mean over so many points to either side. As many are left out at the ends of a wall: they may be
+those of the next one."""
+LEAST_WALL_POINTS = 6
 LEAST_POLE_POINTS = 4
 MOST_BOW = 4.0
 """A run that bends by more than so many standard deviations is round, and no wall."""
@@ -130,16 +133,27 @@ def find_features(points: FloatArray, origins: FloatArray, range_sigma: float) -
     whole = steps <= HOLE * usual
     apart = ~whole | (gaps > nearer * steps / np.sin(STEEPEST) + 5.0 * range_sigma)
     cuts = np.flatnonzero(apart) + 1
-    straight = _split(points, np.concatenate([[0], cuts, [len(points)]]), SPLIT_SIGMAS * range_sigma)
+    bounds = np.concatenate([[0], cuts, [len(points)]])
+    straight = _split(_smooth(points, bounds), bounds, SPLIT_SIGMAS * range_sigma)
     walls, spans = _walls(points, beams, straight, range_sigma)
     # Beyond the ends of the scan there is a hole.
     open_after = np.append(whole & (np.diff(ranges) > LEAST_STEP), False)
     open_before = np.concatenate([[False], whole & (np.diff(ranges) < -LEAST_STEP)])
     corners = _corners(walls, spans, origins, bearings, usual, open_before, open_after, range_sigma)
-    runs = np.column_stack([np.concatenate([[0], cuts]), np.concatenate([cuts, [len(points)]])])
+    runs = np.column_stack([bounds[:-1], bounds[1:]])
     stand_alone = open_before[runs[:, 0]] & open_after[runs[:, 1] - 1] if len(points) else np.zeros(0, bool)
     poles = _poles(runs[stand_alone], origins, ranges, bearings, usual, range_sigma)
     return Features(walls, corners, poles)
+
+
+def _smooth(points: FloatArray, bounds: IntArray) -> FloatArray:
+    """Every point as the mean of itself and its neighbours in the same run."""
+    index, length = np.arange(len(points)), np.diff(bounds)
+    first = np.maximum(index - SMOOTHED, np.repeat(bounds[:-1], length))
+    last = np.minimum(index + SMOOTHED + 1, np.repeat(bounds[1:], length))
+    sums = np.vstack([np.zeros(2), np.cumsum(points, axis=0)])
+    smooth: FloatArray = (sums[last] - sums[first]) / (last - first)[:, None]
+    return smooth
 
 
 def _split(points: FloatArray, bounds: IntArray, threshold: float) -> list[tuple[int, int]]:
@@ -148,7 +162,7 @@ def _split(points: FloatArray, bounds: IntArray, threshold: float) -> list[tuple
     waiting = list(zip(bounds[:-1].tolist(), bounds[1:].tolist(), strict=True))[::-1]
     while waiting:
         begin, end = waiting.pop()
-        if end - begin < LEAST_WALL_POINTS:
+        if end - begin < LEAST_WALL_POINTS + 2 * SMOOTHED:
             continue
         chord = points[end - 1] - points[begin]
         length = float(np.hypot(chord[0], chord[1]))
@@ -168,11 +182,10 @@ def _walls(
 ) -> tuple[Walls, IntArray]:
     """Lines through the runs, as far as they are walls; and the runs (K, 2) of these, begin and end."""
     spans = np.array(straight, dtype=np.int64).reshape(-1, 2)
-    # The outermost points may be those of the next surface.
-    size = spans[:, 1] - spans[:, 0] - 2
+    size = spans[:, 1] - spans[:, 0] - 2 * SMOOTHED
     begin = np.cumsum(size) - size
     own = np.repeat(np.arange(len(spans)), size)
-    chosen = np.arange(len(own)) - begin[own] + spans[own, 0] + 1
+    chosen = np.arange(len(own)) - begin[own] + spans[own, 0] + SMOOTHED
 
     def mean(values: FloatArray) -> FloatArray:
         sums: FloatArray = np.add.reduceat(values, begin, axis=0)
