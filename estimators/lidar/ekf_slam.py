@@ -16,7 +16,7 @@ from estimators.lidar.feature_map import FeatureMap, Kind
 from estimators.lidar.features import Features, find_features
 from estimators.lidar.scan_fit import LEAST_INFORMATION
 from estimators.lidar.scan_preparation import PreparedScan, ScanPreparation
-from estimators.lidar.sightings import STATES, SpotSightings, WallSightings
+from estimators.lidar.sightings import STATES, Rows, SpotSightings, WallSightings
 from estimators.messages import FloatArray, IntArray, Measurement, PoseIncrement, Scan
 from estimators.models.motion import constant_velocity, cubic_between, smooth_motion
 
@@ -24,9 +24,6 @@ UNKNOWN_SPEED_SIGMA = 1.0
 """Standard deviation of each velocity [m/s, rad/s] before anything was matched."""
 LEAST_GAP_NS = 1_000_000
 """A scan that ends sooner after the one before is none that a scanner makes."""
-MOST_ITERATIONS = 5
-CONVERGED = 1e-5
-"""A step of the pose that is smaller [m, rad] is the last."""
 LOST_SIGMA = np.array([1.0, 0.35])
 """With a prediction less certain than this [m] in every direction, or than this in yaw [rad], features are
 not told apart and linearising means nothing."""
@@ -58,9 +55,9 @@ class EkfSlam:
             description="of more features those that were not seen for longest are forgotten",
         )
         keyframe_distance: float = Field(
-            0.5, gt=0, le=5, description="increments start anew after this much travel [m]"
+            1.0, gt=0, le=5, description="increments start anew after this much travel [m]"
         )
-        keyframe_angle_deg: float = Field(20.0, gt=0, le=180, description="... or this much turn [deg]")
+        keyframe_angle_deg: float = Field(45.0, gt=0, le=180, description="... or this much turn [deg]")
         min_known_share: float = Field(
             0.3,
             gt=0,
@@ -88,7 +85,10 @@ class EkfSlam:
             description="the fastest swaying, as of a gait, that scans are deskewed for [Hz]",
         )
         stamp_sigma_ms: float = Field(
-            1.0, ge=0, le=100, description="standard deviation of a scan's stamp [ms]"
+            3.0,
+            ge=0,
+            le=100,
+            description="standard deviation of the scans' constant latency; 1 when calibrated [ms]",
         )
 
     def __init__(
@@ -106,6 +106,7 @@ class EkfSlam:
         self._preparation = ScanPreparation(preparation or ScanPreparation.Config(), T_body_lidar)
         self._map: FeatureMap | None = None
         self._keyframe_ns = self._stamp_ns = 0
+        self._keyframe_velocity = np.zeros(3)
         self._keyframe_is_blind = False
         self.points = np.empty((0, 2))
         """(N, 2) [m] of the newest scan, as seen from where the body is at its end."""
@@ -145,6 +146,7 @@ class EkfSlam:
         look.augment(here, look.all_new())
         self._map = here
         self._keyframe_ns = self._stamp_ns = scan.stamp_ns
+        self._keyframe_velocity = np.zeros(3)
         self._keyframe_is_blind = True
         self.points, self.points_cov = look.seen_from_end(here)
         return PoseIncrement(scan.stamp_ns, scan.stamp_ns, np.zeros(3), np.zeros((3, 3)), is_keyframe=True)
@@ -158,16 +160,17 @@ class EkfSlam:
         if not look.has_features:
             return None
         here.predict(F, Q)
-        predicted, expected = here.pose.copy(), here.pose_cov.copy()
+        expected = here.pose_cov.copy()
         matches = look.match(here)
         if _is_lost(expected) or look.known_share(matches) < config.min_known_share:
             self.refused += 1
             self._map = None
             return self._begin(scan)
         look.correct(here, matches)
-        increment, cov = _said_by_scan(predicted, expected, here.pose.copy(), here.pose_cov)
-        velocity = here.states[9:]
-        cov += (1e-3 * config.stamp_sigma_ms) ** 2 * np.outer(velocity, velocity)
+        increment, cov = here.pose.copy(), _said_by_scan(expected, here.pose_cov)
+        # A late stamp does nothing to a motion that goes on as it was at the keyframe.
+        change = here.states[9:] - self._carried(here.pose)
+        cov += (1e-3 * config.stamp_sigma_ms) ** 2 * np.outer(change, change)
         look.note(here, matches)
         look.augment(here, matches)
         _forget(here, config.max_features)
@@ -179,7 +182,13 @@ class EkfSlam:
         if is_keyframe:
             here.move_origin()
             self._keyframe_ns, self._keyframe_is_blind = scan.stamp_ns, False
+            self._keyframe_velocity = here.states[9:].copy()
         return found
+
+    def _carried(self, pose: FloatArray) -> FloatArray:
+        """Velocity (3,) of a point at the pose that goes on with the body as it moved at the keyframe."""
+        forward, left, rate = self._keyframe_velocity
+        return np.array([forward - rate * pose[1], left + rate * pose[0], rate])
 
     def _moved_far(self, pose: FloatArray) -> bool:
         return bool(
@@ -246,28 +255,22 @@ class _Look:
 
     def correct(self, here: FeatureMap, matches: dict[Kind, Matches]) -> None:
         """Stages 2 and 3: iterated update with all sightings of known features."""
-        prior = here.mean.copy()
         walls, wall_of = _known(matches[Kind.WALL])
         sightings = self._walls.chosen(walls)
-        spots = [
-            (kind, self._spots[kind].chosen(which), feature)
-            for kind, (which, feature) in ((kind, _known(matches[kind])) for kind in self._spots)
-        ]
-        cov = here.cov
-        for _ in range(MOST_ITERATIONS):
+        spots: list[tuple[SpotSightings, IntArray, int]] = []
+        for kind, seen in self._spots.items():
+            which, feature = _known(matches[kind])
+            # Across a wall, the wall says all there is to say of its corner.
+            spots.append((seen.chosen(which), feature, 1 if kind is Kind.CORNER else 2))
+
+        def look() -> Rows:
             features = here.features
             rows = sightings.rows(here.states, wall_of, features[wall_of], here.anchors[wall_of])
-            for kind, seen, feature in spots:
-                # Across a wall, the wall says all there is to say of its corner.
-                rows += seen.rows(here.states, feature, features[feature], 1 if kind is Kind.CORNER else 2)
-            H = here.jacobian(rows)
-            gain, cov = here.gain(H, rows.noise)
-            before = here.pose.copy()
-            here.mean = prior + gain @ (H @ (here.mean - prior) - rows.residual)
-            if float(np.abs(here.pose - before).max()) < CONVERGED:
-                break
-        here.cov = cov
-        here.wrap()
+            for seen, feature, directions in spots:
+                rows += seen.rows(here.states, feature, features[feature], directions)
+            return rows
+
+        here.correct(look)
 
     def note(self, here: FeatureMap, matches: dict[Kind, Matches]) -> None:
         """Remember what was seen of known features."""
@@ -323,24 +326,19 @@ def _is_lost(expected: FloatArray) -> bool:
     return bool(least > LOST_SIGMA[0] ** 2 or expected[2, 2] > LOST_SIGMA[1] ** 2)
 
 
-def _said_by_scan(
-    predicted: FloatArray, expected: FloatArray, pose: FloatArray, cov: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Pose (3,) and covariance (3, 3) as the scan says without the prediction.
+def _said_by_scan(expected: FloatArray, cov: FloatArray) -> FloatArray:
+    """Covariance (3, 3) of the pose as the scan says it without the prediction.
 
-    What no feature holds goes on as predicted, and is a metre less certain than that.
+    What no feature holds goes on as predicted, and is a metre less certain than that. The pose itself stays
+    the filter's: so errors of one increment are made good by the next.
 
     Args:
-        predicted: (3,) pose before the update.
-        expected: (3, 3) its covariance.
-        pose: (3,) pose after the update.
-        cov: (3, 3) its covariance.
+        expected: (3, 3) covariance before the update.
+        cov: (3, 3) after it.
     """
-    known = np.linalg.inv(cov)
     least = np.linalg.inv(expected + np.eye(3) / LEAST_INFORMATION)
-    said = np.linalg.inv(known - np.linalg.inv(expected) + least)
-    said = 0.5 * (said + said.T)
-    return pose, said
+    said = np.linalg.inv(np.linalg.inv(cov) - np.linalg.inv(expected) + least)
+    return 0.5 * (said + said.T)
 
 
 def _forget(here: FeatureMap, most: int) -> None:

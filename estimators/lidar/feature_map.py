@@ -12,15 +12,23 @@ Source: Castellanos, Martinez-Cantin, Tardos and Neira, "Robocentric map joining
 EKF-SLAM", Robotics and Autonomous Systems 55, 2007.
 """
 
+from collections.abc import Callable
 from enum import IntEnum
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve, solve_triangular
+from scipy.linalg import cho_factor, cho_solve
 
 from estimators.geometry import inverse, rotation, transform, wrap_angle, wrap_angles
 from estimators.lidar.scan_fit import LEAST_INFORMATION, held_directions
 from estimators.lidar.sightings import NOW, STATES, Rows
 from estimators.messages import FloatArray, IntArray
+
+MOST_ITERATIONS = 5
+CONVERGED = 1e-5
+"""A step of the pose that is smaller [m, rad] is the last."""
+UNTHREADED = 8
+"""Rows that are taken into the covariance at once: of more, BLAS would start threads for it, and wait for
+them longer than the product takes."""
 
 
 class Kind(IntEnum):
@@ -93,27 +101,41 @@ class FeatureMap:
         self.cov[6:STATES, 6:STATES] += Q
         self.unseen += 1
 
-    def jacobian(self, rows: Rows) -> FloatArray:
-        """Derivative (R, 12 + 2 M) of the residuals by everything, without directions that nothing holds."""
-        by_pose = rows.by_states[:, :3] + rows.by_states[:, 6:9]
-        weight = 1.0 / rows.noise[:, None]
-        feigned = rows.feigned.T @ (weight * rows.feigned) + LEAST_INFORMATION * np.eye(3)
-        held = held_directions(by_pose.T @ (weight * by_pose), feigned)
-        H = np.zeros((len(rows.residual), len(self.mean)))
-        H[:, :STATES] = (rows.by_states.reshape(-1, 4, 3) @ held).reshape(-1, STATES)
-        index = np.arange(len(H))
-        H[index, STATES + 2 * rows.feature] = rows.by_feature[:, 0]
-        H[index, STATES + 2 * rows.feature + 1] = rows.by_feature[:, 1]
-        return H
+    def correct(self, look: Callable[[], Rows]) -> None:
+        """Stage 3: iterated update.
 
-    def gain(self, H: FloatArray, noise: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Kalman gain (N, R) for rows with this derivative, and the covariance (N, N) after them."""
-        HP = H @ self.cov
-        S = HP @ H.T
-        S[np.diag_indices(len(S))] += noise
-        factor = cho_factor(S, lower=True)
-        root = solve_triangular(factor[0], HP, lower=True)
-        return np.asarray(cho_solve(factor, HP)).T, self.cov - root.T @ root
+        Directions of the pose that no row holds stay as predicted.
+
+        Args:
+            look: gives the rows at the present mean.
+
+        Source: Bell and Cathey, "The iterated Kalman filter update as a Gauss-Newton method", IEEE
+        Transactions on Automatic Control 38, 1993.
+        """
+        prior = self.mean
+        for _ in range(MOST_ITERATIONS):
+            rows = look()
+            by_states = _held(rows)
+            columns = STATES + 2 * rows.feature[:, None] + [0, 1]
+            HP = by_states @ self.cov[:STATES]
+            HP += (rows.by_feature[:, :, None] * self.cov[columns]).sum(axis=1)
+            S = HP[:, :STATES] @ by_states.T
+            S += (HP[:, columns] * rows.by_feature).sum(axis=2)
+            S[np.diag_indices(len(S))] += rows.noise
+            factor = cho_factor(S, lower=True)
+            moved = self.mean - prior
+            linear = by_states @ moved[:STATES] + (rows.by_feature * moved[columns]).sum(axis=1)
+            before = self.pose
+            self.mean = prior + cho_solve(factor, linear - rows.residual) @ HP
+            if float(np.abs(self.pose - before).max()) < CONVERGED:
+                break
+        root = np.linalg.inv(np.tril(factor[0]))
+        for first in range(0, len(root), UNTHREADED):
+            part = root[first : first + UNTHREADED] @ HP
+            self.cov -= part.T @ part
+        self.mean[8] = wrap_angle(self.mean[8])
+        walls = STATES + 2 * np.flatnonzero(self.kinds == Kind.WALL)
+        self.mean[walls] = wrap_angles(self.mean[walls])
 
     def add(
         self, kind: Kind, values: FloatArray, anchors: FloatArray, extents: FloatArray, rows: Rows
@@ -189,8 +211,11 @@ class FeatureMap:
         cov = T @ self.cov @ T.T
         self.cov = 0.5 * (cov + cov.T)
 
-    def wrap(self) -> None:
-        """Bring angles back into one turn."""
-        self.mean[8] = wrap_angle(self.mean[8])
-        walls = STATES + 2 * np.flatnonzero(self.kinds == Kind.WALL)
-        self.mean[walls] = wrap_angles(self.mean[walls])
+
+def _held(rows: Rows) -> FloatArray:
+    """Derivative (R, 12) by the states, without directions of the pose that nothing holds."""
+    by_pose = rows.by_states[:, :3] + rows.by_states[:, 6:9]
+    weight = 1.0 / rows.noise[:, None]
+    feigned = rows.feigned.T @ (weight * rows.feigned) + LEAST_INFORMATION * np.eye(3)
+    held = held_directions(by_pose.T @ (weight * by_pose), feigned)
+    return (rows.by_states.reshape(-1, 4, 3) @ held).reshape(-1, STATES)
