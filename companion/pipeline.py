@@ -22,6 +22,7 @@ from drivers.autopilot import Autopilot
 from drivers.framing import Sensor
 from estimators import make_estimator
 from estimators.base import Estimator, Report, Sketch, Sketched
+from estimators.lidar.front_ends import ScanFrontEnd, make_scan_front_end
 from estimators.lidar.fused_odometry import FusedOdometry
 from estimators.lidar.scan_matching import ScanMatcher
 from estimators.messages import LoopClosure, Measurement, PoseEstimate, PoseIncrement, RangeFrame, Scan
@@ -259,9 +260,18 @@ def make_front_end(
         close_loops: look for closures although none of the estimators has a use for them.
     """
     inputs = config.mavlink.inputs
-    matcher = ScanMatcher(config.scan_matcher, config.lidar_mounting(), config.scan_preparation)
-    look_back = make_look_back(config, matcher, names, close_loops)
-    return FusedOdometry(matcher) if inputs.odometry or inputs.wheels else matcher, look_back
+    scans = make_scan_odometry(config)
+    # EKF-SLAM holds scans against its own map and has no keyframes to look back from.
+    if not isinstance(scans, ScanMatcher):
+        return scans, None
+    look_back = make_look_back(config, scans, names, close_loops)
+    return FusedOdometry(scans) if inputs.odometry or inputs.wheels else scans, look_back
+
+
+def make_scan_odometry(config: Config) -> ScanFrontEnd:
+    """What turns the site's scans into increments."""
+    name, mounting = config.pipeline.front_end, config.lidar_mounting()
+    return make_scan_front_end(name, config.front_end_config(), mounting, config.scan_preparation)
 
 
 def make_pipeline(config: Config, names: list[str]) -> Pipeline:

@@ -140,6 +140,11 @@ BAD_INPUT = {
         ["run", "--site", "demo_room", "--mavlink", "text.mcap"],
         "'text.mcap' is no device string: it is a file",
     ),
+    "odometry for EKF-SLAM": (
+        ["dump-config", "--site", "demo_room", "--set", "pipeline.front_end=ekf_slam"]
+        + ["--set", "mavlink.inputs.odometry=10"],
+        "inputs.odometry and inputs.wheels need pipeline.front_end",
+    ),
     "unknown scenario": (
         ["emulate", "moon"],
         "no file moon and none of that name in params/scenarios; there are: chen2019, corridor, ",

@@ -135,7 +135,8 @@ def bias_sigmas(truth: FloatArray) -> list[float]:
     recording = Recording(drive(truth, 0), setup, NOISE, {})
     graph = recording.graph(truth, find_anchors=True, find_biases=True)
     graph.ranges[:, factors.RANGE_LOSS] = GAUSSIAN.kind
-    return np.sqrt(solve(graph).covariances(graph.free)[: len(HALL.anchors), 2, 2]).tolist()
+    variances = solve(graph).covariances(graph.free)[: len(HALL.anchors), 2, 2]
+    return [float(sigma) for sigma in np.sqrt(variances)]
 
 
 @pytest.mark.parametrize("seed", range(3))

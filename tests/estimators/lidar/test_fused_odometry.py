@@ -33,7 +33,7 @@ SHARE, LEAST = 0.05, 1e-3
 def odometry(path: Arc | Loop, seconds: float, seed: int, begin: float = 0.0) -> list[PoseIncrement]:
     """Steps of an odometry along a path."""
     rng = np.random.default_rng(seed)
-    poses = path.poses(begin + STEP * np.arange(round(seconds / STEP) + 1))
+    poses = path.poses(begin + STEP * np.arange(round(seconds / STEP) + 1, dtype=np.float64))
     first_ns = round(begin * 1e9)
     steps = [PoseIncrement(first_ns, first_ns, np.zeros(3), np.zeros((3, 3)), is_keyframe=True)]
     for before, after in pairwise(poses):
