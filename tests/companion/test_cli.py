@@ -141,8 +141,10 @@ BAD_INPUT = {
         "'text.mcap' is no device string: it is a file",
     ),
     "odometry for EKF-SLAM": (
-        ["dump-config", "--site", "demo_room", "--set", "pipeline.front_end=ekf_slam"]
-        + ["--set", "mavlink.inputs.odometry=10"],
+        [
+            *("dump-config", "--site", "demo_room"),
+            *("--set", "pipeline.front_end=ekf_slam", "--set", "mavlink.inputs.odometry=10"),
+        ],
         "inputs.odometry and inputs.wheels need pipeline.front_end",
     ),
     "unknown scenario": (
