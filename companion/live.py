@@ -278,6 +278,8 @@ class LiveRun:
                 self._say(line)
 
     def _close(self) -> None:
+        # So far a replay gives ticks, though nothing arrived after the last of them.
+        self._log.raw(RawChunk(MAVLINK, Direction.IN, self._chain.stamp_to_log(0), b""))
         for name, sensor in self._chain.sensors.items():
             for data in sensor.closing():
                 self._send(name, data)

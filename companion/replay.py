@@ -202,8 +202,6 @@ def replay(
         for tick in chain.feed(record):
             take(tick)
         last_ns = max(last_ns, record.stamp_ns)
-    for tick in chain.advance(last_ns):
-        take(tick)
     if not fed:
         wanted = ", ".join(chain.sensors) or "none"
         raise UserError(f"{log.path}: no bytes of the site's sensors in it (sensors: {wanted})")
