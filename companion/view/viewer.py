@@ -3,8 +3,9 @@
 import os
 import socket
 import subprocess
-import sys
 import time
+from importlib.util import find_spec
+from pathlib import Path
 from typing import Literal
 
 from companion.config import ViewTable
@@ -42,14 +43,14 @@ class Viewer:
                 options += ["--cors-allow-origin", f"http://*:{table.web_port}"]
         else:
             options += ["--expect-data-soon"]
-        self._process = subprocess.Popen(  # noqa: S603  # our own interpreter, checked settings
-            [sys.executable, "-m", "rerun_cli", *options],
+        self._process = subprocess.Popen(  # noqa: S603  # a program of ours with checked settings
+            [_program(), *options],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
             env={**os.environ, "RERUN_APP_ONLY": "true"},
-            # Ctrl-C in the terminal is meant for the run, which then ends the viewer.
-            start_new_session=True,
+            # A window outlives the run; a page ends with whatever process group serves it.
+            start_new_session=mode == "native",
         )
         os.setpriority(os.PRIO_PROCESS, self._process.pid, _NICE)
 
@@ -94,9 +95,7 @@ class Viewer:
 
     def kill(self) -> None:
         """End it at once, whatever state it is in."""
-        # It is a process behind a process of Python, both in a session of their own.
-        if self.is_running:
-            os.killpg(self._process.pid, 9)
+        self._process.kill()
         self._process.wait()
 
 
@@ -111,6 +110,15 @@ def check_viewer(mode: Mode, table: ViewTable) -> None:
     _check_port(_address(mode, table), table.data_port, "view.data_port")
     if mode == "web":
         _check_port(_address(mode, table), table.web_port, "view.web_port")
+
+
+def _program() -> str:
+    """Rerun's viewer, without the Python program before it, which would not hand on that it was killed."""
+    spec = find_spec("rerun_cli")
+    program = Path(spec.origin if spec is not None and spec.origin else "").with_name("rerun")
+    if not program.is_file():
+        raise UserError(f"rerun: the viewer is not installed for this system (no file {program})")
+    return str(program)
 
 
 def free_port() -> int:
