@@ -79,8 +79,8 @@ View = Annotated[
     typer.Option(
         "--view",
         metavar="WHERE",
-        help="Show it in Rerun while it runs: web (a page for a browser, see the table view), native (a "
-        "window on this computer) or off.",
+        help="Show it in Rerun: web (a page for a browser, see the table view), native (a window on this "
+        "computer) or off. `run` shows it while it runs.",
     ),
 ]
 Sets = Annotated[
@@ -109,6 +109,7 @@ def demo(
         "out/demo"
     ),
     seed: Seed = None,
+    view: View = "off",
     sets: Sets = None,
 ) -> None:
     """Run the whole chain without hardware and compare it with the truth.
@@ -144,7 +145,15 @@ def demo(
     out.print()
     out.print(f"  picture  {folder / 'demo.png'}", highlight=False)
     out.print(f"  log      {folder / 'raw.mcap'}", highlight=False)
-    out.print(f"  review   rerun {folder / 'replay.rrd'}", highlight=False)
+    out.print(f"  review   companion review {folder}", highlight=False)
+    shown = _shown(view)
+    if shown != "off":
+        from companion.view.viewer import Viewer
+
+        viewer = Viewer(shown, loaded.config.view, folder / "replay.rrd")
+        if viewer.is_page:
+            err.print(f"open {viewer.page}; served until Ctrl-C", soft_wrap=True)
+            viewer.serve_until_interrupted()
 
 
 @app.command()

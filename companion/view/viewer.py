@@ -1,8 +1,10 @@
 """Rerun's own viewer as a process beside ours: in a window, or as a page for a browser."""
 
 import os
+import signal
 import socket
 import subprocess
+import threading
 import time
 from importlib.util import find_spec
 from pathlib import Path
@@ -20,17 +22,18 @@ _NICE = 10
 
 
 class Viewer:
-    """A viewer that waits for data.
+    """A viewer of a file, or one that waits for data.
 
     Args:
         mode: "web" serves a page and its data at `view.bind`; "native" opens a window on this computer.
         table: addresses and limits.
+        file: `.rrd` file to show; None to wait for data.
 
     Raises:
         UserError: no screen for a window, or a port is in use.
     """
 
-    def __init__(self, mode: Mode, table: ViewTable) -> None:
+    def __init__(self, mode: Mode, table: ViewTable, file: Path | None = None) -> None:
         self._mode, self._bind = mode, _address(mode, table)
         check_viewer(mode, table)
         self._data_port, self._web_port = table.data_port, table.web_port
@@ -42,7 +45,8 @@ class Viewer:
                 # The page comes from this computer under whatever name the browser has for it.
                 options += ["--cors-allow-origin", f"http://*:{table.web_port}"]
         else:
-            options += ["--expect-data-soon"]
+            options += ["--expect-data-soon"] if file is None else []
+        options += [str(file)] if file is not None else []
         self._process = subprocess.Popen(  # noqa: S603  # a program of ours with checked settings
             [_program(), *options],
             stdin=subprocess.DEVNULL,
@@ -92,6 +96,15 @@ class Viewer:
             time.sleep(0.05)
         self.kill()
         raise UserError("rerun: the viewer does not start; try: python -m rerun_cli --version")
+
+    def serve_until_interrupted(self) -> None:
+        """Wait for Ctrl-C, or until it ends by itself; then end it."""
+        stop = threading.Event()
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, lambda *_: stop.set())
+        while self.is_running and not stop.wait(0.2):
+            pass
+        self.kill()
 
     def kill(self) -> None:
         """End it at once, whatever state it is in."""
