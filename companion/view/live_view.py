@@ -23,7 +23,7 @@ PERIOD = 0.1
 """The mailbox is emptied so often [s]."""
 MAILBOX = 600
 """Items that it holds: some 5 s of a run."""
-CLOSING = 10.0
+CLOSING = 30.0
 """The drawing process has so long [s] to begin, if it has not yet, and to finish its files."""
 
 
