@@ -38,7 +38,7 @@ class Shift:
         stamp_ns: since when.
         shift: (2,) [m], map frame.
         bias: of all its ranges [m], where that explains them as well as a shift; else None.
-        before: mean of what the ranges miss, once the best pose is put to them [m].
+        before: median of what the ranges miss, once the best pose is put to them [m].
         after: the same with the anchor there [m].
     """
 
@@ -119,7 +119,7 @@ class RangeMisses:
     def _judged(self, anchor_id: int, begin: int, shift: FloatArray) -> Shift | None:
         y, change, bias = self._stacked(begin, anchor_id)
         left = y - change @ shift
-        before, after = float(np.abs(y).mean()), float(np.abs(left).mean())
+        before, after = float(np.median(np.abs(y))), float(np.median(np.abs(left)))
         spread = float(np.linalg.eigvalsh(change.T @ change / (len(self._bins) - begin))[0])
         noise = self._noise(begin)
         constant = _least_absolute(bias, y)

@@ -77,8 +77,8 @@ View = Annotated[
     typer.Option(
         "--view",
         metavar="WHERE",
-        help="Show it in Rerun while it runs: web (a page for a browser, see the table view), native (a "
-        "window on this computer) or off.",
+        help="Show it in Rerun: web (a page for a browser, see the table view), native (a window on this "
+        "computer) or off. `run` shows it while it runs.",
     ),
 ]
 
@@ -99,6 +99,7 @@ def demo(
         "out/demo"
     ),
     seed: Seed = None,
+    view: View = "off",
     sets: Sets = None,
 ) -> None:
     """Run the whole chain without hardware and compare it with the truth.
@@ -131,7 +132,15 @@ def demo(
     out.print()
     out.print(f"  picture  {folder / 'demo.png'}")
     out.print(f"  log      {folder / 'raw.mcap'}")
-    out.print(f"  review   rerun {folder / 'replay.rrd'}")
+    out.print(f"  review   companion review {folder}")
+    where = _shown(view)
+    if where != "off":
+        from companion.view.viewer import Viewer
+
+        viewer = Viewer(where, loaded.config.view, folder / "replay.rrd")
+        if viewer.is_page:
+            err.print(f"open {viewer.page}; served until Ctrl-C")
+            viewer.serve_until_interrupted()
 
 
 @app.command()

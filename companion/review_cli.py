@@ -1,7 +1,5 @@
 """`companion review`: a log replayed into Rerun, with a list of what happened and when."""
 
-import signal
-import threading
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -108,7 +106,8 @@ def review(
         stream.disconnect()
         out.print(f"  written to {save}; open it with: rerun {save}", soft_wrap=True)
     elif viewer is not None and viewer.is_page:
-        _serve(viewer, err)
+        err.print("served until Ctrl-C")
+        viewer.serve_until_interrupted()
 
 
 def _stream(
@@ -137,16 +136,6 @@ def _stream(
             err.print(f"open {viewer.page}", soft_wrap=True)
     stream.send_recording_name(f"{stream_name}, review")
     return stream, viewer
-
-
-def _serve(viewer: "Viewer", err: Console) -> None:
-    stop = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
-    err.print("served until Ctrl-C")
-    while viewer.is_running and not stop.wait(0.2):
-        pass
-    viewer.kill()
 
 
 def _print(found: "Review", took: float, out: Console) -> None:

@@ -23,8 +23,8 @@ PERIOD = 0.1
 """The mailbox is emptied so often [s]."""
 MAILBOX = 600
 """Items that it holds: some 5 s of a run."""
-CLOSING = 3.0
-"""The drawing process has so long [s] to finish its files."""
+CLOSING = 30.0
+"""The drawing process has so long [s] to begin, if it has not yet, and to finish its files."""
 
 
 class LiveView:
@@ -67,6 +67,17 @@ class LiveView:
         self._thread = threading.Thread(target=self._run, name="view", daemon=True)
         self._thread.start()
 
+    @property
+    def process_id(self) -> int:
+        """Of the process that draws."""
+        assert self._process.pid is not None
+        return self._process.pid
+
+    @property
+    def waiting(self) -> int:
+        """Items in the mailbox."""
+        return len(self._mailbox)
+
     def put(self, item: Item) -> None:
         """Take something to be shown, or to be forgotten when the viewer is slow; never waits."""
         if self._is_open:
@@ -76,10 +87,13 @@ class LiveView:
         """Let files be finished and end the view."""
         self._closing.set()
         self._thread.join(CLOSING)
-        self._process.join(CLOSING)
+        if not self._thread.is_alive():
+            self._process.join(CLOSING)
         if self._process.is_alive():
+            # It waits for a viewer that has stalled.
             with suppress(ProcessLookupError):
-                os.killpg(self._process.pid or 0, signal.SIGKILL)
+                os.killpg(self.process_id, signal.SIGKILL)
+            self._process.kill()
         self._process.join()
 
     def _run(self) -> None:

@@ -1,10 +1,13 @@
 """Rerun's own viewer as a process beside ours: in a window, or as a page for a browser."""
 
 import os
+import signal
 import socket
 import subprocess
-import sys
+import threading
 import time
+from importlib.util import find_spec
+from pathlib import Path
 from typing import Literal
 
 from companion.config import ViewTable
@@ -19,17 +22,18 @@ _NICE = 10
 
 
 class Viewer:
-    """A viewer that waits for data.
+    """A viewer of a file, or one that waits for data.
 
     Args:
         mode: "web" serves a page and its data at `view.bind`; "native" opens a window on this computer.
         table: addresses and limits.
+        file: `.rrd` file to show; None to wait for data.
 
     Raises:
         UserError: no screen for a window, or a port is in use.
     """
 
-    def __init__(self, mode: Mode, table: ViewTable) -> None:
+    def __init__(self, mode: Mode, table: ViewTable, file: Path | None = None) -> None:
         self._mode, self._bind = mode, _address(mode, table)
         check_viewer(mode, table)
         self._data_port, self._web_port = table.data_port, table.web_port
@@ -41,15 +45,16 @@ class Viewer:
                 # The page comes from this computer under whatever name the browser has for it.
                 options += ["--cors-allow-origin", f"http://*:{table.web_port}"]
         else:
-            options += ["--expect-data-soon"]
-        self._process = subprocess.Popen(  # noqa: S603  # our own interpreter, checked settings
-            [sys.executable, "-m", "rerun_cli", *options],
+            options += ["--expect-data-soon"] if file is None else []
+        options += [str(file)] if file is not None else []
+        self._process = subprocess.Popen(  # noqa: S603  # a program of ours with checked settings
+            [_program(), *options],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
             env={**os.environ, "RERUN_APP_ONLY": "true"},
-            # Ctrl-C in the terminal is meant for the run, which then ends the viewer.
-            start_new_session=True,
+            # A window outlives the run; a page ends with whatever process group serves it.
+            start_new_session=mode == "native",
         )
         os.setpriority(os.PRIO_PROCESS, self._process.pid, _NICE)
 
@@ -92,11 +97,18 @@ class Viewer:
         self.kill()
         raise UserError("rerun: the viewer does not start; try: python -m rerun_cli --version")
 
+    def serve_until_interrupted(self) -> None:
+        """Wait for Ctrl-C, or until it ends by itself; then end it."""
+        stop = threading.Event()
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, lambda *_: stop.set())
+        while self.is_running and not stop.wait(0.2):
+            pass
+        self.kill()
+
     def kill(self) -> None:
         """End it at once, whatever state it is in."""
-        # It is a process behind a process of Python, both in a session of their own.
-        if self.is_running:
-            os.killpg(self._process.pid, 9)
+        self._process.kill()
         self._process.wait()
 
 
@@ -111,6 +123,15 @@ def check_viewer(mode: Mode, table: ViewTable) -> None:
     _check_port(_address(mode, table), table.data_port, "view.data_port")
     if mode == "web":
         _check_port(_address(mode, table), table.web_port, "view.web_port")
+
+
+def _program() -> str:
+    """Rerun's viewer, without the Python program before it, which would not hand on that it was killed."""
+    spec = find_spec("rerun_cli")
+    program = Path(spec.origin if spec is not None and spec.origin else "").with_name("rerun")
+    if not program.is_file():
+        raise UserError(f"rerun: the viewer is not installed for this system (no file {program})")
+    return str(program)
 
 
 def free_port() -> int:

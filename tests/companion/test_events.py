@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from companion.anchor_shift import RangeMisses
-from companion.config import params_dir
 from companion.events import Event, EventFinder
 from companion.log import Log, Truth
 from companion.log_edit.edit import edit_log
@@ -86,17 +85,13 @@ def test_an_anchor_that_falls_silent_is_lost(walk: Path, tmp_path: Path) -> None
     assert event.text.count("until the end") == 1
 
 
-@pytest.mark.parametrize(
-    ("anchor", "x", "y", "at", "title"),
-    [(3, -0.4, 0.3, 0.0, "A3 moved or biased"), (1, 0.5, 0.0, 6.0, "A1 moved")],
-    ids=["seen so that a bias would do", "in the middle of the run"],
-)
+@pytest.mark.parametrize(("anchor", "x", "y", "at"), [(3, -0.4, 0.3, 0.0), (1, 0.5, 0.0, 6.0)])
 def test_an_anchor_moved_by_half_a_metre_is_named(
-    walk: Path, tmp_path: Path, anchor: int, x: float, y: float, at: float, title: str
+    walk: Path, tmp_path: Path, anchor: int, x: float, y: float, at: float
 ) -> None:
     events = edited(walk, tmp_path, f"moved:anchor={anchor},x={x},y={y},at={at}")
     ((seconds, moved),) = [found for found in events if "moved" in found[1].title]
-    assert moved.title == title
+    assert moved.title.startswith(f"A{anchor} moved")
     assert seconds == pytest.approx(at, abs=1.5)
     words = moved.text.split()
     found = float(words[words.index("x") + 1]), float(words[words.index("y") + 1])
@@ -104,7 +99,9 @@ def test_an_anchor_moved_by_half_a_metre_is_named(
 
 
 def test_a_kidnapped_robot_is_named(tmp_path: Path) -> None:
-    scenario = load_scenario(params_dir() / "scenarios" / "kidnapped_raw.toml", 1, [])
+    kidnap = "[[kidnap]]\nat = 3.0\nto = [5.5, 4.5, 120.0]\n"
+    (tmp_path / "kidnap.toml").write_text(f'site = "{SITE}"\n{WALK}{kidnap}', encoding="utf-8")
+    scenario = load_scenario(tmp_path / "kidnap.toml", 1, [])
     events = events_of(write_log(scenario, tmp_path / "kidnapped.mcap"))
     kidnapped = next(at for at, event in events if event.title == "most ranges contradict the pose")
     at, reset = next(found for found in events if found[1].title == "reset 1")
@@ -115,17 +112,17 @@ def test_a_kidnapped_robot_is_named(tmp_path: Path) -> None:
 def misses(
     residual: Callable[[int, FloatArray, int], float], seconds: int = 20, side: float = 4.0
 ) -> RangeMisses:
-    """Residuals with noise of 5 cm at 5 Hz on a circle among four anchors; the pose errs by up to 0.3 m."""
+    """Residuals with noise of 5 cm at 10 Hz on a circle among four anchors; the pose errs by up to 0.3 m."""
     rng, found = np.random.default_rng(4), RangeMisses()
     corners = np.array([[0.0, 0.0], [0.0, 4.0], [4.0, 4.0], [4.0, 0.0]])
-    for k in range(5 * seconds):
-        angle = 2.0 * np.pi * k / (5 * seconds)
+    for k in range(10 * seconds):
+        angle = 2.0 * np.pi * k / (10 * seconds)
         tag = 2.0 + 0.25 * side * np.array([np.cos(angle), np.sin(angle)])
-        error = 0.3 * np.array([np.sin(k / 25), np.cos(k / 15)])
+        error = 0.3 * np.array([np.sin(k / 50), np.cos(k / 30)])
         for i, corner in enumerate(corners):
             u = (tag - corner) / np.linalg.norm(tag - corner)
             noisy = residual(i, u, k) - float(u @ error) + rng.normal(0.0, 0.05)
-            found.add(k * 200_000_000, i, noisy, tag - corner)
+            found.add(k * 100_000_000, i, noisy, tag - corner)
     return found
 
 
@@ -134,12 +131,12 @@ def shifted(x: float, y: float, since: int = 0) -> Callable[[int, FloatArray, in
 
 
 def test_a_shift_is_found_with_its_beginning_though_the_pose_errs_and_ranges_are_blocked() -> None:
-    clean = shifted(0.4, -0.3, since=30)
+    clean = shifted(0.4, -0.3, since=60)
     found = misses(lambda i, u, k: clean(i, u, k) + 2.0 * (i == 0 and k % 11 == 0)).shift()
     assert found is not None
     assert (found.anchor_id, found.bias) == (2, None)
     assert found.shift == pytest.approx(np.array([0.4, -0.3]), abs=0.1)
-    assert found.stamp_ns == pytest.approx(30 * 200_000_000, abs=2_000_000_000)
+    assert found.stamp_ns == pytest.approx(60 * 100_000_000, abs=2_000_000_000)
 
 
 def test_a_bias_is_offered_where_it_explains_as_much() -> None:
@@ -149,7 +146,7 @@ def test_a_bias_is_offered_where_it_explains_as_much() -> None:
 
 @pytest.mark.parametrize(
     "residual",
-    [shifted(0.0, 0.0), shifted(0.1, 0.0), lambda i, _u, k: 0.6 * (i == 1 and 30 <= k < 60)],
+    [shifted(0.0, 0.0), shifted(0.1, 0.0), lambda i, _u, k: 0.6 * (i == 1 and 60 <= k < 120)],
     ids=["noise", "too small", "blocked for a while"],
 )
 def test_what_is_no_shift_is_not_called_one(residual: Callable[[int, FloatArray, int], float]) -> None:
