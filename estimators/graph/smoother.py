@@ -228,9 +228,8 @@ class GraphSmoother(KeyframeTracker):
         except GraphError:
             return Report((Verdict.GATED,))
         variable = self._window.variable(place)
-        nis = self._judging.motion_nis(
-            measured, self._window.graph.values[variable], self._window.newest[0], cov
-        )
+        at, now = self._window.graph.values[variable], self._window.newest[0]
+        nis = self._judging.motion_nis(measured, at, now, cov)
         rows = factors.increments(variable, -1, measured.increment, measured.cov)
         passes = nis <= self._increment_gate and self._take(measured.stamp_ns, "increments", rows)
         return Report((Verdict.ACCEPTED if passes else Verdict.GATED,), np.full(1, np.nan), np.array([nis]))

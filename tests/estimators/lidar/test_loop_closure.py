@@ -73,13 +73,18 @@ def test_a_second_lap_is_closed_on_the_first(drift: FloatArray) -> None:
 def test_keyframes_just_before_are_no_closure() -> None:
     closer = LoopCloser(LoopCloser.Config(keyframes_between=3))
     pose = np.array([2.2, 1.6, 0.3])
-    found = [closer.add(k, pose, still(ROOM, pose, k), STILL) for k in range(5)]
+    found = [closer.add(k, pose, still(ROOM, pose, k), STILL) for k in range(9)]
     assert [closure and (closure.from_stamp_ns, closure.stamp_ns) for closure in found] == [
         (0, 0),
         None,
         None,
         None,
         (0, 4),
+        # The same passage.
+        None,
+        None,
+        None,
+        (0, 8),
     ]
     assert closer.refused == 0
 
