@@ -49,7 +49,11 @@ class GraphSmoother(KeyframeTracker):
 
         lag: float = Field(3.0, gt=0, le=60, description="the window reaches back so far [s]")
         places: int = Field(
-            20, ge=0, le=200, description="poses of so many places, the newest, stay in it for loop closures"
+            10,
+            ge=0,
+            le=200,
+            description="poses of so many places, the newest, stay in it for loop closures; the time of an "
+            "update grows with their square",
         )
 
     def __init__(self, config: Config, setup: Setup) -> None:

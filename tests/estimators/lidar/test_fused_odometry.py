@@ -33,7 +33,7 @@ SHARE, LEAST = 0.05, 1e-3
 def odometry(path: Arc | Loop, seconds: float, seed: int) -> list[PoseIncrement]:
     """Steps of an odometry along a path."""
     rng = np.random.default_rng(seed)
-    times: FloatArray = STEP * np.arange(round(seconds / STEP) + 1)
+    times = (STEP * np.arange(round(seconds / STEP) + 1)).astype(np.float64)
     poses = path.poses(times)
     steps = [PoseIncrement(0, 0, np.zeros(3), np.zeros((3, 3)), is_keyframe=True)]
     for before, after in pairwise(poses):

@@ -26,7 +26,10 @@ STILL = np.zeros((3, 3))
 def closures_of_laps(scans: int, drift: FloatArray) -> list[LoopClosure]:
     """Closures on a path round the room, believed to be at the true pose plus a drift that grows."""
     path, rng = Loop(), np.random.default_rng(1)
-    matcher, closer = ScanMatcher(ScanMatcher.Config(), np.zeros(3)), LoopCloser(LoopCloser.Config())
+    matcher, closer = (
+        ScanMatcher(ScanMatcher.Config(), np.zeros(3)),
+        LoopCloser(LoopCloser.Config(spacing=1.0)),
+    )
     found = []
     for k in range(scans):
         increment = matcher.update(scan_while_moving(ROOM, path, k * PERIOD, rng, SIGMA))
