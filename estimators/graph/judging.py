@@ -143,7 +143,14 @@ def judge_landmarks(
 def motion_nis(
     measured: PoseIncrement | LoopClosure, reference: FloatArray, pose: FloatArray, cov: FloatArray
 ) -> float:
-    """Normalised innovation squared of a motion; the covariance (9, 9) is of pose, velocity, reference."""
+    """Normalised innovation squared of a motion between two poses that are known together.
+
+    Args:
+        measured: the motion.
+        reference: (3,) pose where it begins.
+        pose: (3,) pose where it ends.
+        cov: (9, 9) covariance of this pose, its velocity and the reference.
+    """
     predicted, by_reference, by_pose = increment(reference, pose)
     H = np.zeros((3, 9))
     H[:, :3], H[:, 6:] = by_pose, by_reference
@@ -151,7 +158,13 @@ def motion_nis(
 
 
 def increment_nis(measured: PoseIncrement | LoopClosure, predicted: FloatArray, spread: FloatArray) -> float:
-    """Normalised innovation squared of an increment, whose prediction has a covariance (3, 3)."""
+    """Normalised innovation squared of a motion.
+
+    Args:
+        measured: the motion.
+        predicted: (3,) what it was thought to be.
+        spread: (3, 3) covariance of that.
+    """
     residual = measured.increment - predicted
     residual[2] = wrap_angle(residual[2])
     return float(residual @ np.linalg.solve(spread + measured.cov, residual))

@@ -48,7 +48,11 @@ class GraphSmoother(KeyframeTracker):
 
         lag: float = Field(3.0, gt=0, le=60, description="the window reaches back so far [s]")
         places: int = Field(
-            20, ge=0, le=200, description="poses of so many places, the newest, stay in it for loop closures"
+            10,
+            ge=0,
+            le=200,
+            description="poses of so many places, the newest, stay in it for loop closures; the time of an "
+            "update grows with their square",
         )
 
     def __init__(self, config: Config, setup: Setup) -> None:
@@ -231,9 +235,8 @@ class GraphSmoother(KeyframeTracker):
         except GraphError:
             return Report((Verdict.GATED,))
         variable = self._window.variable(place)
-        nis = self._judging.motion_nis(
-            measured, self._window.graph.values[variable], self._window.newest[0], cov
-        )
+        at, now = self._window.graph.values[variable], self._window.newest[0]
+        nis = self._judging.motion_nis(measured, at, now, cov)
         rows = factors.increments(variable, -1, measured.increment, measured.cov)
         passes = nis <= self._increment_gate and self._take(measured.stamp_ns, "increments", rows)
         return Report((Verdict.ACCEPTED if passes else Verdict.GATED,), np.full(1, np.nan), np.array([nis]))

@@ -66,7 +66,7 @@ class LoopCloser:
         model_config = ConfigDict(extra="forbid", frozen=True)
 
         spacing: float = Field(
-            1.0,
+            2.0,
             gt=0,
             le=50,
             description="a keyframe this far from every known place founds one [m]; 1 rad counts as 0.5 m",

@@ -12,7 +12,7 @@ from estimators.graph.batch import smooth
 from estimators.graph.recording import Noise, Recording
 from estimators.graph.smoother import GraphSmoother
 from estimators.messages import FloatArray, LoopClosure, PoseIncrement
-from tests.estimators.matched_world import HALL
+from tests.estimators.matched_world import HALL, true_ranges
 
 STEP_NS = 500_000_000
 LAP = 40
@@ -138,6 +138,9 @@ def test_a_place_where_the_robot_stood_at_first_is_known_again() -> None:
     steps = [m for m in drive(truth, seed=6) if m.stamp_ns > 0]
     estimator.update(PoseIncrement(0, 0, np.zeros(3), np.zeros((3, 3)), is_keyframe=True))
     assert estimator.update(LoopClosure(0, 0, np.zeros(3), np.zeros((3, 3)))).verdicts == (Verdict.ACCEPTED,)
+    for k in range(1, 5):
+        # What it hears while it stands goes to the one pose there is.
+        estimator.update(true_ranges(k * STEP_NS // 10, truth[0], HALL))
     verdicts = [estimator.update(m).verdicts[0] for m in steps]
     assert verdicts[-1] is Verdict.ACCEPTED
 

@@ -30,12 +30,12 @@ SHARE, LEAST = 0.05, 1e-3
 """What a step errs by: this much of its length and turn, and so much [m, rad] beside it."""
 
 
-def odometry(path: Arc | Loop, seconds: float, seed: int, begin: float = 0.0) -> list[PoseIncrement]:
+def odometry(path: Arc | Loop, seconds: float, seed: int) -> list[PoseIncrement]:
     """Steps of an odometry along a path."""
     rng = np.random.default_rng(seed)
-    poses = path.poses(begin + STEP * np.arange(round(seconds / STEP) + 1, dtype=np.float64))
-    first_ns = round(begin * 1e9)
-    steps = [PoseIncrement(first_ns, first_ns, np.zeros(3), np.zeros((3, 3)), is_keyframe=True)]
+    times = (STEP * np.arange(round(seconds / STEP) + 1)).astype(np.float64)
+    poses = path.poses(times)
+    steps = [PoseIncrement(0, 0, np.zeros(3), np.zeros((3, 3)), is_keyframe=True)]
     for before, after in pairwise(poses):
         step = between(before, after)
         along, about = SHARE * np.hypot(step[0], step[1]) + LEAST, SHARE * abs(step[2]) + LEAST

@@ -29,7 +29,7 @@ class Swing:
 def samples(path: Swing, seconds: float, seed: int) -> list[ImuSample]:
     rng = np.random.default_rng(seed)
     stamps_ns = SAMPLE_NS * np.arange(round(seconds * 1e9 / SAMPLE_NS))
-    times = stamps_ns.astype(np.float64) * 1e-9
+    times = (stamps_ns * 1e-9).astype(np.float64)
     ahead, behind = path.poses(times + 1e-4)[:, 2], path.poses(times - 1e-4)[:, 2]
     rates = (ahead - behind) / 2e-4 + BIAS + NOISE * rng.standard_normal(len(times))
     return [

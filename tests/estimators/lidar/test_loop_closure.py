@@ -26,7 +26,10 @@ STILL = np.zeros((3, 3))
 def closures_of_laps(scans: int, drift: FloatArray) -> list[LoopClosure]:
     """Closures on a path round the room, believed to be at the true pose plus a drift that grows."""
     path, rng = Loop(), np.random.default_rng(1)
-    matcher, closer = ScanMatcher(ScanMatcher.Config(), np.zeros(3)), LoopCloser(LoopCloser.Config())
+    matcher, closer = (
+        ScanMatcher(ScanMatcher.Config(), np.zeros(3)),
+        LoopCloser(LoopCloser.Config(spacing=1.0)),
+    )
     found = []
     for k in range(scans):
         increment = matcher.update(scan_while_moving(ROOM, path, k * PERIOD, rng, SIGMA))
@@ -73,13 +76,18 @@ def test_a_second_lap_is_closed_on_the_first(drift: FloatArray) -> None:
 def test_keyframes_just_before_are_no_closure() -> None:
     closer = LoopCloser(LoopCloser.Config(keyframes_between=3))
     pose = np.array([2.2, 1.6, 0.3])
-    found = [closer.add(k, pose, still(ROOM, pose, k), STILL) for k in range(5)]
+    found = [closer.add(k, pose, still(ROOM, pose, k), STILL) for k in range(9)]
     assert [closure and (closure.from_stamp_ns, closure.stamp_ns) for closure in found] == [
         (0, 0),
         None,
         None,
         None,
         (0, 4),
+        # The same passage.
+        None,
+        None,
+        None,
+        (0, 8),
     ]
     assert closer.refused == 0
 
