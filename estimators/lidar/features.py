@@ -139,7 +139,7 @@ def find_features(points: FloatArray, origins: FloatArray, range_sigma: float) -
     # Beyond the ends of the scan there is a hole.
     open_after = np.append(whole & (np.diff(ranges) > LEAST_STEP), False)
     open_before = np.concatenate([[False], whole & (np.diff(ranges) < -LEAST_STEP)])
-    corners = _corners(walls, spans, origins, bearings, usual, open_before, open_after, range_sigma)
+    corners = _corners(walls, spans, points, origins, bearings, usual, open_before, open_after, range_sigma)
     runs = np.column_stack([bounds[:-1], bounds[1:]])
     stand_alone = open_before[runs[:, 0]] & open_after[runs[:, 1] - 1] if len(points) else np.zeros(0, bool)
     poles = _poles(runs[stand_alone], origins, ranges, bearings, usual, range_sigma)
@@ -229,6 +229,7 @@ def _walls(
 def _corners(
     walls: Walls,
     spans: IntArray,
+    points: FloatArray,
     origins: FloatArray,
     bearings: FloatArray,
     usual: float,
@@ -242,10 +243,13 @@ def _corners(
     wall = np.concatenate([first, last])
     beam = np.concatenate([spans[first, 0], spans[last, 1] - 1])
     beyond = np.concatenate([spans[first, 0] - 1, spans[last, 1]])
+    # Along a wall that is seen at a glance, the next beam may meet the same wall far away.
+    normal = np.column_stack([np.cos(walls.angle[wall]), np.sin(walls.angle[wall])])
+    behind = (normal * (walls.centre[wall] - points[beyond])).sum(axis=1) > LEAST_STEP
+    wall, beam, beyond, normal = wall[behind], beam[behind], beyond[behind], normal[behind]
     turned = 0.5 * wrap_angles(bearings[beyond] - bearings[beam])
     towards = bearings[beam] + turned
     ray = np.column_stack([np.cos(towards), np.sin(towards)])
-    normal = np.column_stack([np.cos(walls.angle[wall]), np.sin(walls.angle[wall])])
     sine = -(normal * ray).sum(axis=1)
     distance = (normal * (origins[beam] - walls.centre[wall])).sum(axis=1) / sine
     # The edge is anywhere between the beams.
