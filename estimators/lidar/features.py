@@ -24,6 +24,10 @@ LEAST_WALL_POINTS = 6
 LEAST_POLE_POINTS = 4
 MOST_BOW = 4.0
 """A run that bends by more than so many standard deviations is round, and no wall."""
+SHARP = np.deg2rad(40.0)
+"""Pieces of a run that bend by less where they meet are of something round, and no walls ..."""
+MOST_BEND = 3.0
+"""... if they bend by more than so many standard deviations."""
 MOST_NOISE = 2.0
 """Points of a wall scatter by at most so many standard deviations of a range."""
 LEAST_WALL = 0.3
@@ -211,7 +215,18 @@ def _walls(
     square = s * beams[chosen, 0] - c * beams[chosen, 1]
     variance = np.maximum(range_sigma**2 * mean(square**2), scatter * size / np.maximum(size - 2, 1))
     low, high = np.minimum.reduceat(u, begin), np.maximum.reduceat(u, begin)
-    good = (high - low >= LEAST_WALL) & (bent < MOST_BOW) & (scatter < (MOST_NOISE * range_sigma) ** 2)
+    slopes = variance / (spread * size)
+    turn = np.abs(wrap_angles(np.diff(along)))
+    goes_on = (spans[1:, 0] < spans[:-1, 1]) & (turn < SHARP)
+    bends = goes_on & (turn > MOST_BEND * np.sqrt(slopes[1:] + slopes[:-1]))
+    surface = np.concatenate([[0], np.cumsum(~goes_on)])
+    is_round = np.isin(surface, surface[1:][bends])
+    good = (
+        ~is_round
+        & (high - low >= LEAST_WALL)
+        & (bent < MOST_BOW)
+        & (scatter < (MOST_NOISE * range_sigma) ** 2)
+    )
     of_good = good[own]
     return Walls(
         chosen[of_good],
@@ -222,7 +237,7 @@ def _walls(
         low[good],
         high[good],
         (u / (spread * size)[own])[of_good],
-        np.column_stack([variance / size, variance / (spread * size)])[good],
+        np.column_stack([variance / size, slopes])[good],
     ), spans[good]
 
 

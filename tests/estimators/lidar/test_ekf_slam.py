@@ -105,10 +105,11 @@ def test_along_a_corridor_it_knows_that_it_knows_nothing(heading: float) -> None
         assert error @ np.linalg.solve(cov, error) < 25.0
 
 
-def test_a_round_hall_does_not_make_the_heading_wrong_and_sure() -> None:
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_round_hall_has_no_walls_to_go_by(seed: int) -> None:
     path = Arc(np.zeros(3), np.array([0.3, 0.0, 0.2]))
-    errors, covs = errors_of(increments_of(slam(), scans_along(round_hall(5.0), path, 25, 1)), path)
-    assert (nees_of(errors, covs) < 25.0).all()
+    found = increments_of(slam(), scans_along(round_hall(5.0), path, 25, seed))
+    assert all(increment.from_stamp_ns == increment.stamp_ns for increment in found)
 
 
 def test_another_room_is_not_taken_for_this_one() -> None:
