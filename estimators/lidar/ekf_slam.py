@@ -104,7 +104,8 @@ class EkfSlam:
         self._config = config
         self._T_body_lidar = T_body_lidar
         self._preparation = ScanPreparation(preparation or ScanPreparation.Config(), T_body_lidar)
-        self._map: FeatureMap | None = None
+        self.map: FeatureMap | None = None
+        """Motion and features as estimated; None before the first feature."""
         self._keyframe_ns = self._stamp_ns = 0
         self._keyframe_velocity = np.zeros(3)
         self._keyframe_is_blind = False
@@ -127,12 +128,12 @@ class EkfSlam:
             self._preparation.observe(measurement)
             return None
         stamp_ns = measurement.end_stamp_ns
-        if self._map is not None and stamp_ns < self._stamp_ns + LEAST_GAP_NS:
+        if self.map is not None and stamp_ns < self._stamp_ns + LEAST_GAP_NS:
             return None
         scan = self._preparation.prepare(measurement)
         if len(scan.points) < self._config.min_points:
             return None
-        return self._begin(scan) if self._map is None else self._track(scan, self._map)
+        return self._begin(scan) if self.map is None else self._track(scan, self.map)
 
     def _begin(self, scan: PreparedScan) -> PoseIncrement | None:
         """Found a map where nothing is known of the motion."""
@@ -144,7 +145,8 @@ class EkfSlam:
         if not look.has_features:
             return None
         look.augment(here, look.all_new())
-        self._map = here
+        _forget(here, self._config.max_features)
+        self.map = here
         self._keyframe_ns = self._stamp_ns = scan.stamp_ns
         self._keyframe_velocity = np.zeros(3)
         self._keyframe_is_blind = True
@@ -164,7 +166,7 @@ class EkfSlam:
         matches = look.match(here)
         if _is_lost(expected) or look.known_share(matches) < config.min_known_share:
             self.refused += 1
-            self._map = None
+            self.map = None
             return self._begin(scan)
         look.correct(here, matches)
         increment, cov = here.pose.copy(), _said_by_scan(expected, here.pose_cov)

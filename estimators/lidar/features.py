@@ -24,6 +24,10 @@ LEAST_WALL_POINTS = 6
 LEAST_POLE_POINTS = 4
 MOST_BOW = 4.0
 """A run that bends by more than so many standard deviations is round, and no wall."""
+SHARP = np.deg2rad(40.0)
+"""Pieces of a run that bend by less where they meet are of something round, and no walls ..."""
+MOST_BEND = 3.0
+"""... if they bend by more than so many standard deviations."""
 MOST_NOISE = 2.0
 """Points of a wall scatter by at most so many standard deviations of a range."""
 LEAST_WALL = 0.3
@@ -139,7 +143,7 @@ def find_features(points: FloatArray, origins: FloatArray, range_sigma: float) -
     # Beyond the ends of the scan there is a hole.
     open_after = np.append(whole & (np.diff(ranges) > LEAST_STEP), False)
     open_before = np.concatenate([[False], whole & (np.diff(ranges) < -LEAST_STEP)])
-    corners = _corners(walls, spans, origins, bearings, usual, open_before, open_after, range_sigma)
+    corners = _corners(walls, spans, points, origins, bearings, usual, open_before, open_after, range_sigma)
     runs = np.column_stack([bounds[:-1], bounds[1:]])
     stand_alone = open_before[runs[:, 0]] & open_after[runs[:, 1] - 1] if len(points) else np.zeros(0, bool)
     poles = _poles(runs[stand_alone], origins, ranges, bearings, usual, range_sigma)
@@ -211,7 +215,18 @@ def _walls(
     square = s * beams[chosen, 0] - c * beams[chosen, 1]
     variance = np.maximum(range_sigma**2 * mean(square**2), scatter * size / np.maximum(size - 2, 1))
     low, high = np.minimum.reduceat(u, begin), np.maximum.reduceat(u, begin)
-    good = (high - low >= LEAST_WALL) & (bent < MOST_BOW) & (scatter < (MOST_NOISE * range_sigma) ** 2)
+    slopes = variance / (spread * size)
+    turn = np.abs(wrap_angles(np.diff(along)))
+    goes_on = (spans[1:, 0] < spans[:-1, 1]) & (turn < SHARP)
+    bends = goes_on & (turn > MOST_BEND * np.sqrt(slopes[1:] + slopes[:-1]))
+    surface = np.concatenate([[0], np.cumsum(~goes_on)])
+    is_round = np.isin(surface, surface[1:][bends])
+    good = (
+        ~is_round
+        & (high - low >= LEAST_WALL)
+        & (bent < MOST_BOW)
+        & (scatter < (MOST_NOISE * range_sigma) ** 2)
+    )
     of_good = good[own]
     return Walls(
         chosen[of_good],
@@ -222,13 +237,14 @@ def _walls(
         low[good],
         high[good],
         (u / (spread * size)[own])[of_good],
-        np.column_stack([variance / size, variance / (spread * size)])[good],
+        np.column_stack([variance / size, slopes])[good],
     ), spans[good]
 
 
 def _corners(
     walls: Walls,
     spans: IntArray,
+    points: FloatArray,
     origins: FloatArray,
     bearings: FloatArray,
     usual: float,
@@ -242,10 +258,13 @@ def _corners(
     wall = np.concatenate([first, last])
     beam = np.concatenate([spans[first, 0], spans[last, 1] - 1])
     beyond = np.concatenate([spans[first, 0] - 1, spans[last, 1]])
+    # Along a wall that is seen at a glance, the next beam may meet the same wall far away.
+    normal = np.column_stack([np.cos(walls.angle[wall]), np.sin(walls.angle[wall])])
+    behind = (normal * (walls.centre[wall] - points[beyond])).sum(axis=1) > LEAST_STEP
+    wall, beam, beyond, normal = wall[behind], beam[behind], beyond[behind], normal[behind]
     turned = 0.5 * wrap_angles(bearings[beyond] - bearings[beam])
     towards = bearings[beam] + turned
     ray = np.column_stack([np.cos(towards), np.sin(towards)])
-    normal = np.column_stack([np.cos(walls.angle[wall]), np.sin(walls.angle[wall])])
     sine = -(normal * ray).sum(axis=1)
     distance = (normal * (origins[beam] - walls.centre[wall])).sum(axis=1) / sine
     # The edge is anywhere between the beams.

@@ -7,6 +7,9 @@ import pytest
 
 from companion.config import Config, config_from_toml, default_toml, load_config, params_dir
 from companion.errors import UserError
+from companion.pipeline import make_front_end
+from estimators.lidar.ekf_slam import EkfSlam
+from estimators.lidar.scan_matching import ScanMatcher
 from tests.conftest import SITE
 
 SITE_TEXT = SITE.read_text(encoding="utf-8")
@@ -143,3 +146,12 @@ def test_radians_and_metres_reach_the_estimators(config: Config) -> None:
     assert setup.anchors[2].tolist() == raw["anchors"]["2"]
     assert setup.start.sigma[2] == pytest.approx(raw["start"]["sigma_yaw_deg"] * 3.14159265 / 180)
     assert setup.height_to(setup.anchors[0]) == pytest.approx(2.2 - 0.30 - 0.20)
+
+
+def test_the_front_end_is_chosen_by_name_with_its_own_table(config: Config) -> None:
+    assert isinstance(make_front_end(config), ScanMatcher)
+    text = config.to_toml()
+    chosen = config_from_toml(text, "x", ["pipeline.front_end=ekf_slam", "ekf_slam.max_features=7"])
+    assert isinstance(make_front_end(chosen), EkfSlam)
+    with pytest.raises(UserError, match="unknown front end 'icp', there are: ekf_slam, scan_matcher"):
+        config_from_toml(text, "x", ["pipeline.front_end=icp"])
