@@ -84,13 +84,18 @@ def ranges(
         found = fit_biases(by_anchor)
     out = result_console()
     out.print(_range_table(found, config))
-    for anchor_id in _badly_seen(found):
-        message_console().print(
+    err, badly_seen = message_console(), _badly_seen(found)
+    for anchor_id in badly_seen:
+        err.print(
             f"[yellow]anchor {anchor_id}: its errors scatter too much for noise, something stood before it; "
-            "calibrate in line of sight[/]",
-            soft_wrap=True,
+            "calibrate in line of sight[/]"
         )
     residual_figure(found, picture, f"{config.site.name}: ranges of {log.name}")
+    if badly_seen and against == "lidar":
+        # Poses and biases were found together: one wrong anchor shifts the way, and with it all biases.
+        err.print(f"  picture {picture}")
+        err.print("[red]nothing written: without known positions one hidden anchor spoils the bias of all[/]")
+        raise typer.Exit(1)
     write_range_bias(site, found, to or site)
     out.print(f"  common bias {found.common:+.4f} +- {found.common_sigma:.4f} m, {found.common_ns:+.2f} ns")
     out.print(f"  written to {to or site}, table range_bias", soft_wrap=True)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from companion.config import params_dir
+from companion.config import load_config, params_dir
 from companion.errors import UserError
 from companion.evaluation import Evaluation, evaluate_scenario
 from companion.evaluation_table import evaluation_notes
@@ -178,6 +178,21 @@ def test_without_blocked_ranges_least_squares_reaches_the_bound_of_its_frames(tm
     tag_error = np.sqrt(alone.rmse_m**2 - 0.1**2)
     assert tag_error / (alone.rmse_m / alone.epoch_bound_ratio) == pytest.approx(1.0, abs=0.1)
     assert fused.epoch_bound_ratio < 1.0
+
+
+@pytest.mark.parametrize(
+    ("heights", "told"),
+    [((2.0, 2.0, 2.0, 2.0), "height unobservable"), ((0.2, 2.6, 0.3, 2.6), "height from ranges at 9")],
+)
+def test_what_ranges_tell_of_the_height_is_told(
+    tmp_path: Path, heights: tuple[float, ...], told: str
+) -> None:
+    places = load_config(SITE).anchors.items()
+    sets = [f"anchors.{i}=[{x},{y},{z}]" for (i, (x, y, _)), z in zip(places, heights, strict=True)]
+    path = write_scenario(tmp_path, STRAIGHT_ON, FEW)
+    result = evaluate_scenario(path, 1, choices=["momentum_gd:3", "momentum_gd:2"], sets=sets)
+    (note,) = [line for line in evaluation_notes(result) if "height" in line]
+    assert note.startswith(f"momentum_gd:3: {told}")
 
 
 @pytest.mark.parametrize(

@@ -78,6 +78,11 @@ def test_corrected_ranges_have_no_bias_left() -> None:
     assert abs(np.median(fit.residuals(calibrated=True))) < 0.02
 
 
+def test_the_spread_about_the_line_is_that_of_the_noise_alone() -> None:
+    fit = fit_biases({0: drive(np.random.default_rng(1), 0.2, 0.1)}).anchors[0]
+    assert fit.spread == pytest.approx(0.08, abs=0.01)
+
+
 def test_the_common_bias_is_the_mean_and_more_certain_than_any() -> None:
     rng = np.random.default_rng(2)
     found = fit_biases({i: drive(rng, 0.1 * i, 0.0) for i in range(4)})
