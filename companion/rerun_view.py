@@ -16,7 +16,6 @@ from uuid import uuid4
 import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from companion.config import Config
 from companion.errors import UserError
@@ -25,6 +24,7 @@ from companion.health import State
 from companion.log import Truth
 from companion.pipeline import Tick
 from companion.rerun_layout import TIMELINE, blueprint
+from estimators import chi2
 from estimators.base import Report, Verdict
 from estimators.geometry import transform_each, wrap_angles
 from estimators.messages import FloatArray, IntArray, RangeFrame, Scan

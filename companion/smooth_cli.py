@@ -4,15 +4,12 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
 import typer
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from companion.config import load_config
 from companion.errors import UserError
-from companion.log import Log
 
 if TYPE_CHECKING:
     from companion.smooth import SmoothedLog
@@ -41,6 +38,8 @@ def smooth(
     Writes poses.tum, summary.json and smooth.png; with --anchors or --biases a survey of the anchors from the
     drive, and anchors.toml to paste into the site file. Afterwards only: a live pose knows no future.
     """
+    from companion.config import load_config
+    from companion.log import Log
     from companion.plots import figure
     from companion.replay import config_of, tum_line
 
@@ -89,6 +88,8 @@ def smooth(
 
 
 def _anchor_table(found: "SmoothedLog", anchors: bool, biases: bool) -> Table:
+    import numpy as np
+
     table = Table(title="anchors, and what is left of their ranges", title_justify="left")
     headings = ["anchor"]
     headings += ["x\nm", "y\nm", "sigma\nm", "moved\nm"] if anchors else []

@@ -164,3 +164,18 @@ def test_bad_input_gives_one_line_and_exit_code_2(name: str, short_log: Path, tm
     assert done.stderr.count("\n") == 1
     assert done.stderr.startswith("error: ")
     assert set(tmp_path.iterdir()) == before
+
+
+def test_help_loads_nothing_that_takes_long(tmp_path: Path) -> None:
+    slow = "numpy", "scipy", "numba", "pydantic", "pymavlink", "matplotlib", "rerun"
+    code = f"import sys, companion.cli; print([name for name in {slow} if name in sys.modules])"
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": os.getcwd()},
+        text=True,
+        capture_output=True,
+        timeout=100,
+        check=True,
+    )
+    assert done.stdout == "[]\n"
