@@ -10,7 +10,7 @@ import pytest
 
 from companion import __version__
 from companion.config import default_toml
-from tests.conftest import SITE, write_scenario
+from tests.conftest import SITE, Command, write_scenario
 
 SITE_TEXT = SITE.read_text(encoding="utf-8")
 
@@ -86,7 +86,7 @@ def test_dump_config(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "command",
+    "words",
     [
         [],
         ["demo"],
@@ -101,10 +101,13 @@ def test_dump_config(tmp_path: Path) -> None:
         ["doctor", "ports"],
     ],
 )
-def test_help_teaches(tmp_path: Path, command: list[str]) -> None:
-    done = companion(*command, "--help", cwd=tmp_path)
+def test_help_teaches(command: Command, words: list[str]) -> None:
+    done = command(*words, "--help")
     assert done.returncode == 0
     assert len(done.stdout.splitlines()) > 8
+
+
+def test_the_version_is_told(tmp_path: Path) -> None:
     assert companion("--version", cwd=tmp_path).stdout.strip() == __version__
 
 
@@ -113,7 +116,7 @@ BAD_INPUT = {
     "no MCAP": (["replay", "text.mcap"], "text.mcap is not an MCAP file"),
     "unknown estimator": (
         ["replay", "LOG", "--estimator", "magic"],
-        "--estimator: unknown estimator 'magic', there are: ekf, graph, least_squares, lidar_odometry",
+        "--estimator: unknown estimator 'magic', there are: ekf, ",
     ),
     "wrong set": (["replay", "LOG", "--set", "pipeline.rate=999"], "pipeline.rate: Input should be less"),
     "missing site": (["run", "--site", "gone.toml"], "cannot read gone.toml: No such file or directory"),
@@ -139,7 +142,7 @@ BAD_INPUT = {
     ),
     "unknown scenario": (
         ["emulate", "moon"],
-        "no file moon and none of that name in params/scenarios; there are: hostile_room, huang2024, ",
+        "no file moon and none of that name in params/scenarios; there are: ",
     ),
     "unwritable log": (["simulate", "square_room", "--out", "text.mcap/log"], "cannot write the log"),
     "unwritable folder": (["demo", "--out", "text.mcap/demo"], "cannot write the log"),
@@ -148,7 +151,9 @@ BAD_INPUT = {
 
 
 @pytest.mark.parametrize("name", BAD_INPUT)
-def test_bad_input_gives_one_line_and_exit_code_2(name: str, short_log: Path, tmp_path: Path) -> None:
+def test_bad_input_gives_one_line_and_exit_code_2(
+    name: str, short_log: Path, tmp_path: Path, command: Command
+) -> None:
     (tmp_path / "text.mcap").write_text("just text, no table\n")
     (tmp_path / "unknown.toml").write_text(SITE_TEXT.replace("[site]", '[site]\ncolour = "blue"'))
     third = "2 = [7.85, 6.85, 2.3]\n3 = [7.85, 0.15, 1.9]\n"
@@ -157,7 +162,7 @@ def test_bad_input_gives_one_line_and_exit_code_2(name: str, short_log: Path, tm
     (tmp_path / "line.toml").write_text(SITE_TEXT.replace(third, "2 = [0.15, 9.0, 2.3]\n"))
     arguments, said = BAD_INPUT[name]
     before = set(tmp_path.iterdir())
-    done = companion(*(str(short_log) if word == "LOG" else word for word in arguments), cwd=tmp_path)
+    done = command(*(str(short_log) if word == "LOG" else word for word in arguments))
     assert done.returncode == 2
     assert done.stdout == ""
     assert said in done.stderr
