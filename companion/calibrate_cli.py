@@ -2,17 +2,18 @@
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
 import typer
 from rich import box
 from rich.table import Table
 
-from companion.calibration.ranges import Calibration
-from companion.config import Config, load_config
 from companion.errors import UserError
 from companion.terminal import message_console, result_console
+
+if TYPE_CHECKING:
+    from companion.calibration.ranges import Calibration
+    from companion.config import Config
 
 MAX_SPREAD, MIN_USED_SHARE = 0.2, 0.8
 """An anchor whose used errors scatter more than this [m], or with a smaller share used, was hidden."""
@@ -59,11 +60,14 @@ def ranges(
     the stay, in seconds since the log began), x, y, z (of the tag's antenna, in metres). The site file
     keeps its comments and its order.
     """
+    import numpy as np
+
     from companion.calibration.picture import residual_figure
     from companion.calibration.ranges import fit_biases, ranges_by_anchor
     from companion.calibration.recording import read_recording
     from companion.calibration.reference import tags_from_points, tags_from_truth
     from companion.calibration.site_file import write_range_bias
+    from companion.config import load_config
     from companion.log import Log
 
     config = load_config(site)
@@ -112,6 +116,7 @@ def mounting(log: Log_, site: Site, until: Until = None, figures: Json = None) -
     """
     from companion.calibration.drive import mounting_on_drive
     from companion.calibration.recording import read_recording
+    from companion.config import load_config
     from companion.log import Log
 
     config = load_config(site)
@@ -141,7 +146,7 @@ def mounting(log: Log_, site: Site, until: Until = None, figures: Json = None) -
     )
 
 
-def _badly_seen(found: Calibration) -> list[int]:
+def _badly_seen(found: "Calibration") -> list[int]:
     """Anchors whose errors scatter more than noise does, or of whose ranges many were left out."""
     return [
         anchor_id
@@ -150,7 +155,9 @@ def _badly_seen(found: Calibration) -> list[int]:
     ]
 
 
-def _range_table(found: Calibration, config: Config) -> Table:
+def _range_table(found: "Calibration", config: "Config") -> Table:
+    import numpy as np
+
     table = Table(
         title=f"{config.site.name}: range minus distance",
         title_justify="left",
@@ -182,7 +189,7 @@ def _range_table(found: Calibration, config: Config) -> Table:
     return table
 
 
-def _range_figures(found: Calibration) -> dict[str, object]:
+def _range_figures(found: "Calibration") -> dict[str, object]:
     return {
         "common_m": found.common,
         "common_sigma_m": found.common_sigma,

@@ -7,11 +7,9 @@ from datetime import datetime
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 import typer
 from rich.markup import escape
 
-from companion.config import named_file
 from companion.terminal import message_console, result_console
 
 EXIT_NOT_FOLLOWED = 1
@@ -46,6 +44,9 @@ def sitl(
 
     Exit codes: 0 it followed, 1 it had no position of its own, 2 the call is wrong or there is no SITL.
     """
+    import numpy as np
+
+    from companion.config import named_file
     from companion.sim.scenario import load_scenario
     from companion.sitl import SitlRun
 

@@ -4,13 +4,10 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
 import typer
 from rich.table import Table
 
-from companion.config import load_config
 from companion.errors import UserError
-from companion.log import Log
 from companion.terminal import Sets, message_console, progress, result_console
 
 if TYPE_CHECKING:
@@ -37,6 +34,8 @@ def smooth(
     Writes poses.tum, summary.json and smooth.png; with --anchors or --biases a survey of the anchors from the
     drive, and anchors.toml to paste into the site file. Afterwards only: a live pose knows no future.
     """
+    from companion.config import load_config
+    from companion.log import Log
     from companion.plots import figure
     from companion.replay import config_of, tum_line
 
@@ -81,6 +80,8 @@ def _closures(found: "SmoothedLog") -> str:
 
 
 def _anchor_table(found: "SmoothedLog", anchors: bool, biases: bool) -> Table:
+    import numpy as np
+
     table = Table(title="anchors, and what is left of their ranges", title_justify="left")
     headings = ["anchor"]
     headings += ["x\nm", "y\nm", "sigma\nm", "moved\nm"] if anchors else []

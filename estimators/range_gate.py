@@ -6,8 +6,8 @@ from math import sqrt
 from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
-from scipy.stats import chi2
 
+from estimators import chi2
 from estimators.base import Setup, Verdict
 from estimators.messages import FloatArray, Measurement, PoseEstimate, RangeFrame
 from estimators.models.range import reduce_height
@@ -117,7 +117,7 @@ class RangeGate:
     def __init__(self, config: Config, setup: Setup) -> None:
         self._horizontal = HorizontalRanges(config.range_sigma, setup)
         self._excess = config.nlos_excess
-        self._limit = float(chi2.ppf(config.range_gate, 1))
+        self._limit = chi2.ppf(config.range_gate, 1)
         methods = config.nlos
         self._looks_at_residual = "prediction" in methods or "robust" in methods
         self._weighs = "robust" in methods

@@ -8,8 +8,8 @@ solved first, and made more like it in rounds, until every closure counts in ful
 from dataclasses import replace
 
 import numpy as np
-from scipy.stats import chi2
 
+from estimators import chi2
 from estimators.geometry import wrap_angles
 from estimators.graph.factors import Graph
 from estimators.graph.solver import Solution, solve

@@ -9,15 +9,15 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
+from estimators import chi2
 from estimators.geometry import wrap_angles
 from estimators.lidar.feature_map import FeatureMap, Kind
 from estimators.lidar.features import Walls
 from estimators.lidar.sightings import STATES, Rows, SpotSightings, WallSightings
 from estimators.messages import FloatArray, IntArray
 
-GATE = float(chi2.ppf(0.999, 2))
+GATE = chi2.ppf(0.999, 2)
 """Of the squared Mahalanobis distance of a sighting from its feature."""
 NEW_GATE = 4.0 * GATE
 """A sighting that is further from every feature is of a new one; between the gates it is of none."""

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
-from scipy.stats import chi2
 
+from estimators import chi2
 from estimators.geometry import between, compose, inverse, rotation, wrap_angle
 from estimators.lidar.scan_fit import held_directions
 from estimators.messages import FloatArray, LoopClosure

@@ -7,7 +7,7 @@ import pytest
 
 from companion.config import Config, config_from_toml, default_toml, load_config, params_dir
 from companion.errors import UserError
-from companion.pipeline import make_front_end
+from companion.pipeline import make_scan_odometry
 from estimators.lidar.ekf_slam import EkfSlam
 from estimators.lidar.scan_matching import ScanMatcher
 from tests.conftest import SITE
@@ -149,9 +149,9 @@ def test_radians_and_metres_reach_the_estimators(config: Config) -> None:
 
 
 def test_the_front_end_is_chosen_by_name_with_its_own_table(config: Config) -> None:
-    assert isinstance(make_front_end(config), ScanMatcher)
+    assert isinstance(make_scan_odometry(config), ScanMatcher)
     text = config.to_toml()
     chosen = config_from_toml(text, "x", ["pipeline.front_end=ekf_slam", "ekf_slam.max_features=7"])
-    assert isinstance(make_front_end(chosen), EkfSlam)
+    assert isinstance(make_scan_odometry(chosen), EkfSlam)
     with pytest.raises(UserError, match="unknown front end 'icp', there are: ekf_slam, scan_matcher"):
         config_from_toml(text, "x", ["pipeline.front_end=icp"])

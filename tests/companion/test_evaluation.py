@@ -19,7 +19,7 @@ from companion.log import Log
 from companion.replay import config_of, replay
 from companion.sim.scenario import load_scenario
 from companion.trial import TrialFigures, run_trial
-from tests.conftest import SITE, write_log, write_scenario
+from tests.conftest import SITE, Command, write_log, write_scenario
 
 STRAIGHT_ON = "[trajectory]\nwaypoints = [[1.5, 1.2], [3.5, 1.2]]\nlaps = 0\nrest = 1.0\n"
 FEW = "[increments]\nrate = 10\n[uwb]\nrate = 10\n"
@@ -338,9 +338,9 @@ def test_the_command_prints_our_figures_and_the_papers(tmp_path: Path) -> None:
     assert "…" not in done.stdout
 
 
-def test_options_may_come_first(tmp_path: Path) -> None:
+def test_options_may_come_first(tmp_path: Path, command: Command) -> None:
     path = write_scenario(tmp_path, STRAIGHT_ON, FEW)
-    done = companion("--trials", "1", "--workers", "1", "--estimators", "lidar", path, cwd=tmp_path)
+    done = command("evaluate", "--trials", "1", "--workers", "1", "--estimators", "lidar", path)
     assert done.returncode == 0, done.stderr
     assert "scenario: means of 1 trials" in done.stdout
 
@@ -352,22 +352,19 @@ def test_options_may_come_first(tmp_path: Path) -> None:
         (["FILE", "--json", "gone/out.json"], "cannot write gone/out.json: there is no folder gone"),
     ],
 )
-def test_bad_input_gives_one_line_and_exit_code_2(tmp_path: Path, arguments: list[str], said: str) -> None:
+def test_bad_input_gives_one_line_and_exit_code_2(
+    tmp_path: Path, command: Command, arguments: list[str], said: str
+) -> None:
     path = write_scenario(tmp_path, STRAIGHT_ON, FEW)
-    done = companion(*(str(path) if word == "FILE" else word for word in arguments), cwd=tmp_path)
+    done = command("evaluate", *(str(path) if word == "FILE" else word for word in arguments))
     assert done.returncode == 2
     assert done.stdout == ""
     assert said in done.stderr
     assert done.stderr.count("\n") == 1
 
 
-def test_a_scenario_without_bytes_is_refused_where_bytes_are_needed(tmp_path: Path) -> None:
-    path = write_scenario(tmp_path, STRAIGHT_ON, FEW)
-    arguments = [sys.executable, "-m", "companion", "simulate", str(path), "--out", "x"]
-    environment = {**os.environ, "PYTHONPATH": os.getcwd()}
-    done = subprocess.run(
-        arguments, cwd=tmp_path, env=environment, text=True, capture_output=True, timeout=100, check=False
-    )
+def test_a_scenario_without_bytes_is_refused_where_bytes_are_needed(tmp_path: Path, command: Command) -> None:
+    done = command("simulate", write_scenario(tmp_path, STRAIGHT_ON, FEW), "--out", "x")
     assert done.returncode == 2
     assert "a scenario with [increments] has no bytes" in done.stderr
     assert not (tmp_path / "x").exists()
