@@ -131,9 +131,10 @@ def test_the_update_finds_the_least_squares_solution() -> None:
 
     best = least_squares(cost, prior, xtol=1e-14, ftol=1e-14, gtol=1e-14)
     here.correct(lambda: shifted(here.mean))
+    J: FloatArray = np.asarray(best.jac)
     sigma = np.sqrt(np.diag(here.cov))
     np.testing.assert_array_less(np.abs(here.mean - best.x) / sigma, 0.05)
-    np.testing.assert_allclose(sigma, np.sqrt(np.diag(np.linalg.inv(best.jac.T @ best.jac))), rtol=0.02)
+    np.testing.assert_allclose(sigma, np.sqrt(np.diag(np.linalg.inv(J.T @ J))), rtol=0.02)
 
 
 def test_lines_of_walls_are_those_of_an_orthogonal_fit_and_as_uncertain_as_they_say() -> None:
