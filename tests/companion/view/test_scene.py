@@ -307,3 +307,19 @@ def test_long_runs_go_into_several_files_that_hold_every_tick_once(run: Run, tmp
     assert all("map/walls" in part for part in parts)
     points = [len(row) for part in parts for row in part["map/scan"]["Points2D:positions"]]
     assert 0 < max(points) <= 50
+
+
+def test_small_batches_draw_what_one_large_one_draws(
+    run: Run, recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("companion.view.files.BATCH", 40)
+    small = run.show(tmp_path / "run.rrd")
+    for entity, component in (
+        ("map/estimate/ekf/position", "Points2D:positions"),
+        ("map/scan", "Points2D:positions"),
+        ("map/ranges", "LineStrips2D:strips"),
+        ("error/position/ekf", "Scalars:scalars"),
+        ("ranges/verdict/A1", "StateChange:state"),
+    ):
+        rows = [dict(zip(r[entity]["time"], r[entity][component], strict=True)) for r in (small, recording)]
+        assert str(rows[0]) == str(rows[1]), entity
