@@ -146,7 +146,7 @@ def test_a_bias_is_offered_where_it_explains_as_much() -> None:
 
 @pytest.mark.parametrize(
     "residual",
-    [shifted(0.0, 0.0), shifted(0.1, 0.0), lambda i, _u, k: 0.6 * (i == 1 and 60 <= k < 120)],
+    [shifted(0.0, 0.0), shifted(0.1, 0.0), lambda i, _u, k: 0.6 * (i == 1 and 60 <= k < 150)],
     ids=["noise", "too small", "blocked for a while"],
 )
 def test_what_is_no_shift_is_not_called_one(residual: Callable[[int, FloatArray, int], float]) -> None:

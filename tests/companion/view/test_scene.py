@@ -9,11 +9,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from pymavlink.dialects.v20 import all as mavlink2
 from rerun.chunk import RrdReader
 
 from companion.config import Config
 from companion.errors import UserError
-from companion.log import Log, Truth
+from companion.log import Direction, Log, RawChunk, Truth
 from companion.pipeline import Tick
 from companion.replay import config_of, replay
 from companion.sim.world import World
@@ -270,3 +271,55 @@ def test_a_full_disk_is_the_users_error(run: Run, tmp_path: Path) -> None:
             view.close()
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+
+
+def test_the_autopilots_own_position_and_texts_are_shown(run: Run, tmp_path: Path) -> None:
+    view = RerunFiles(run.config, NAMES, tmp_path / "run.rrd", run.ticks[0][0].stamp_ns)
+    packer = mavlink2.MAVLink(None, srcSystem=1, srcComponent=1)
+    position = mavlink2.MAVLink_local_position_ned_message(0, 1.0, 2.0, 0.0, 0.0, 0.0, 0.0)
+    text = mavlink2.MAVLink_statustext_message(4, b"EKF lane switch", 0, 0)
+    for tick, truth in run.ticks[:90]:
+        view.tick(tick, truth)
+    data = bytes(position.pack(packer)) + bytes(text.pack(packer))
+    view.chunk(RawChunk("mavlink", Direction.IN, run.ticks[60][0].stamp_ns, data))
+    view.close()
+    recording = read(tmp_path / "run.rrd")
+    (((x, y),),) = recording["map/autopilot/position"]["Points2D:positions"]
+    heading = run.config.map_heading()
+    assert (x * np.cos(heading) + y * np.sin(heading), x * np.sin(heading) - y * np.cos(heading)) == (
+        pytest.approx((1.0, 2.0), abs=1e-5)
+    )
+    assert any("autopilot: EKF lane switch" in line for (line,) in recording["log"]["TextLog:text"])
+
+
+def test_long_runs_go_into_several_files_that_hold_every_tick_once(run: Run, tmp_path: Path) -> None:
+    view = run.config.view.model_copy(update={"file_minutes": 0.1, "scan_points": 50})
+    config = run.config.model_copy(update={"view": view})
+    files = RerunFiles(config, NAMES, tmp_path / "run.rrd", run.ticks[0][0].stamp_ns)
+    for tick, truth in run.ticks:
+        files.tick(tick, truth)
+    files.close()
+    parts = [read(path) for path in sorted(tmp_path.glob("run*.rrd"))]
+    rows = [len(part["map/estimate/ekf/position"]["time"]) for part in parts]
+    assert {path.name for path in tmp_path.iterdir()} == {"run.rrd", "run-2.rrd", "run-3.rrd"}
+    assert sorted(rows)[-1] == pytest.approx(180, abs=2)
+    assert sum(rows) == len(run.ticks)
+    assert all("map/walls" in part for part in parts)
+    points = [len(row) for part in parts for row in part["map/scan"]["Points2D:positions"]]
+    assert 0 < max(points) <= 50
+
+
+def test_small_batches_draw_what_one_large_one_draws(
+    run: Run, recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("companion.view.files.BATCH", 40)
+    small = run.show(tmp_path / "run.rrd")
+    for entity, component in (
+        ("map/estimate/ekf/position", "Points2D:positions"),
+        ("map/scan", "Points2D:positions"),
+        ("map/ranges", "LineStrips2D:strips"),
+        ("error/position/ekf", "Scalars:scalars"),
+        ("ranges/verdict/A1", "StateChange:state"),
+    ):
+        rows = [dict(zip(r[entity]["time"], r[entity][component], strict=True)) for r in (small, recording)]
+        assert str(rows[0]) == str(rows[1]), entity
