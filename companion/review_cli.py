@@ -9,13 +9,13 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from companion.config import Config, load_config
 from companion.errors import UserError
 from companion.terminal import message_console, progress, result_console
 
 if TYPE_CHECKING:
     import rerun as rr
 
+    from companion.config import Config
     from companion.review import Review
     from companion.view.viewer import Viewer
 
@@ -64,6 +64,7 @@ def review(
     The viewer opens at once and fills while the log is replayed. Estimators always run from the log's start;
     --from and --to choose what is shown. Two logs are shown side by side under one time cursor.
     """
+    from companion.config import load_config
     from companion.log import Log
     from companion.replay import config_of
     from estimators import ESTIMATORS
@@ -111,7 +112,7 @@ def review(
 
 
 def _stream(
-    config: Config, save: Path | None, web: bool, err: Console
+    config: "Config", save: Path | None, web: bool, err: Console
 ) -> "tuple[rr.RecordingStream, Viewer | None]":
     from uuid import uuid4
 

@@ -140,7 +140,7 @@ def test_wheels_beside_a_lidar_count_once_and_disturb_nothing(tmp_path: Path) ->
     assert result.verdicts["ekf"]["no reference"] == 0
     assert result.verdicts["ekf"]["late"] == 0
     # One increment a scan: those of the wheels reach the filter within them.
-    assert result.update_times["scan_matcher"].calls > 80
+    assert result.update_times["front_end"].calls > 80
 
 
 def test_wheels_go_on_when_the_lidar_is_pulled(tmp_path: Path) -> None:

@@ -83,10 +83,6 @@ def mavlink(lines: str) -> tuple[str, str]:
         (mavlink("autopilot_id = 255"), "mavlink: autopilot_id 255 is one of ground_ids"),
         (mavlink("ground_ids = [0]"), "mavlink.ground_ids.0: Input should be greater than or equal to 1"),
         (mavlink("raw_ranges = true"), "mavlink: raw_ranges give anchors by latitude and longitude"),
-        (
-            mavlink("inputs = {wheels = 10}"),
-            "mavlink: increments of a LiDAR and of the autopilot's link cannot be chained",
-        ),
     ],
 )
 def test_a_wrong_site_file_is_refused_in_one_line(change: tuple[str, str], said: str) -> None:
