@@ -64,7 +64,7 @@ def frames(
                 findings.append(judge_autopilot(ours, moved))
     for finding in findings:
         mark = {True: "[green]ok[/]    ", False: "[red]wrong[/] ", None: "[yellow]open[/]  "}[finding.agrees]
-        out.print(f"{mark} {escape(finding.text)}")
+        out.print(f"{mark} {escape(finding.text)}", soft_wrap=True)
     if not all(finding.agrees is not False for finding in findings):
         raise typer.Exit(EXIT_DISAGREES)
     if walker.is_surveyed:

@@ -73,7 +73,7 @@ def sitl(
         rmse = float(np.sqrt(np.mean(np.square(errors))))
         out.print(f"companion: {len(errors)} poses, RMSE {rmse:.3f} m, max {errors.max():.3f} m")
     for line in run.score.lines():
-        out.print(line, markup=False)
-    out.print(f"log: {folder / 'raw.mcap'}")
+        out.print(line, markup=False, soft_wrap=True)
+    out.print(f"log: {folder / 'raw.mcap'}", soft_wrap=True)
     if not run.score.errors:
         raise typer.Exit(EXIT_NOT_FOLLOWED)

@@ -104,7 +104,7 @@ def _judge_log(path: Path, plugged: Sequence[tuple[str, int]], outcome: Outcome)
     sensors = make_sensors(config_of(log, []))
     measured: dict[str, list[int]] = {name: [] for name in sensors}
     for record in log:
-        if isinstance(record, RawChunk) and record.direction is Direction.IN:
+        if isinstance(record, RawChunk) and record.direction is Direction.IN and record.source in sensors:
             for measurement in sensors[record.source].feed(record.data, record.stamp_ns):
                 if isinstance(measurement, PULSE[record.source]):
                     measured[record.source].append(record.stamp_ns)
