@@ -8,7 +8,7 @@ say: the motion model's share is taken out again, and a direction that no featur
 from dataclasses import replace
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from estimators.geometry import inverse, transform, transform_each
 from estimators.lidar.feature_association import NEW, NONE, Matches, match_spots, match_walls, unite_doubles
@@ -19,6 +19,7 @@ from estimators.lidar.scan_preparation import PreparedScan, ScanPreparation
 from estimators.lidar.sightings import STATES, Rows, SpotSightings, WallSightings
 from estimators.messages import FloatArray, IntArray, Measurement, PoseIncrement, Scan
 from estimators.models.motion import constant_velocity, cubic_between, smooth_motion
+from estimators.models.motion_settings import MotionInScans
 
 UNKNOWN_SPEED_SIGMA = 1.0
 """Standard deviation of each velocity [m/s, rad/s] before anything was matched."""
@@ -40,14 +41,9 @@ class EkfSlam:
     they are chosen here. Decorrelation: Bar-Shalom et al., Tracking and Data Fusion, 9.5.
     """
 
-    class Config(BaseModel):
+    class Config(MotionInScans):
         """Settings of the EKF-SLAM."""
 
-        model_config = ConfigDict(extra="forbid", frozen=True)
-
-        range_sigma: float = Field(
-            0.015, gt=0, le=1, description="least standard deviation of a LiDAR range [m]"
-        )
         max_features: int = Field(
             60,
             ge=4,
@@ -63,26 +59,6 @@ class EkfSlam:
             gt=0,
             le=1,
             description="with a smaller share of points on walls that are known, tracking begins anew",
-        )
-        min_points: int = Field(40, ge=10, le=10000, description="scans with fewer returns are skipped")
-        accel_noise: float = Field(
-            0.5,
-            gt=0,
-            le=100,
-            description="density of white acceleration [m/s^2/sqrt(Hz)]: about the robot's acceleration "
-            "times the square root of how long it lasts",
-        )
-        yaw_accel_noise: float = Field(
-            1.5,
-            gt=0,
-            le=100,
-            description="density of white angular acceleration [rad/s^2/sqrt(Hz)], likewise",
-        )
-        bandwidth: float = Field(
-            2.0,
-            gt=0,
-            le=50,
-            description="the fastest swaying, as of a gait, that scans are deskewed for [Hz]",
         )
         stamp_sigma_ms: float = Field(
             3.0,

@@ -3,12 +3,13 @@
 from abc import ABC, abstractmethod
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from estimators import chi2
 from estimators.base import Report, Setup, Verdict
 from estimators.geometry import lift
 from estimators.messages import FloatArray, Measurement, PoseEstimate, PoseIncrement, RangeFrame
+from estimators.models.motion_settings import WhiteAcceleration
 
 START_SPEED_SIGMA = 0.3
 """Standard deviation of each velocity when the robot sets off [m/s, rad/s]."""
@@ -20,26 +21,11 @@ class KeyframeTracker(ABC):
     What is held of the pose, and how it is moved and corrected, is the subclass's.
     """
 
-    class Config(BaseModel):
+    class Config(WhiteAcceleration):
         """Settings of every estimator on increments."""
-
-        model_config = ConfigDict(extra="forbid", frozen=True)
 
         increment_gate: float = Field(
             0.99999, gt=0.5, lt=1, description="share of good increments that pass the NIS gate"
-        )
-        accel_noise: float = Field(
-            0.5,
-            gt=0,
-            le=100,
-            description="density of white acceleration [m/s^2/sqrt(Hz)]: about the robot's acceleration "
-            "times the square root of how long it lasts",
-        )
-        yaw_accel_noise: float = Field(
-            1.5,
-            gt=0,
-            le=100,
-            description="density of white angular acceleration [rad/s^2/sqrt(Hz)], likewise",
         )
 
     def __init__(self, config: Config, setup: Setup) -> None:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from estimators.geometry import inverse, rotation, transform, transform_each
 from estimators.lidar.expectation import MotionNoise, expect
@@ -20,6 +20,7 @@ from estimators.lidar.known_motion import GyroTrack, OdometryTrack
 from estimators.lidar.scan_fit import NEWEST, said_by_scan, search_start, settle
 from estimators.lidar.scan_preparation import PreparedScan, ScanPreparation
 from estimators.messages import FloatArray, ImuSample, Measurement, PoseIncrement, Scan
+from estimators.models.motion_settings import MotionInScans
 
 if TYPE_CHECKING:
     from estimators.lidar.line_map import LineMap, Surface
@@ -57,14 +58,9 @@ class ScanMatcher:
     Barfoot, "Full STEAM ahead", IROS 2015, for states in continuous time.
     """
 
-    class Config(BaseModel):
+    class Config(MotionInScans):
         """Settings of the scan matcher."""
 
-        model_config = ConfigDict(extra="forbid", frozen=True)
-
-        range_sigma: float = Field(
-            0.015, gt=0, le=1, description="least standard deviation of a LiDAR range [m]"
-        )
         max_correspondence: float = Field(
             0.4, gt=0, le=5, description="points further than this from the keyframe are not matched [m]"
         )
@@ -74,26 +70,6 @@ class ScanMatcher:
         keyframe_angle_deg: float = Field(20.0, gt=0, le=180, description="... or this much turn [deg]")
         min_inlier_share: float = Field(
             0.5, gt=0, le=1, description="a match with a smaller share of matched surface points is refused"
-        )
-        min_points: int = Field(40, ge=10, le=10000, description="scans with fewer returns are skipped")
-        accel_noise: float = Field(
-            0.5,
-            gt=0,
-            le=100,
-            description="density of white acceleration [m/s^2/sqrt(Hz)]: about the robot's acceleration "
-            "times the square root of how long it lasts",
-        )
-        yaw_accel_noise: float = Field(
-            1.5,
-            gt=0,
-            le=100,
-            description="density of white angular acceleration [rad/s^2/sqrt(Hz)], likewise",
-        )
-        bandwidth: float = Field(
-            2.0,
-            gt=0,
-            le=50,
-            description="the fastest swaying, as of a gait, that scans are deskewed for [Hz]",
         )
         stamp_sigma_ms: float = Field(
             1.0, ge=0, le=100, description="standard deviation of a scan's stamp [ms]"
