@@ -2,17 +2,16 @@
 
 import numpy as np
 
-from estimators.base import Report, Setup, Verdict
+from estimators.base import Report, Verdict
+from estimators.fix_taker import FixTaker
 from estimators.geometry import wrap_angle
-from estimators.landmark_gate import LandmarkGate
 from estimators.lidar.odometry import POSE, LidarOdometry
-from estimators.messages import FloatArray, LandmarkFrame, Measurement, RangeFrame
+from estimators.messages import FloatArray, LandmarkFrame, RangeFrame
 from estimators.models.landmark import range_and_bearing
 from estimators.models.range import horizontal_range
-from estimators.range_gate import RangeGate
 
 
-class Ekf(LidarOdometry):
+class Ekf(FixTaker, LidarOdometry):
     """LiDAR odometry held in place by tightly coupled UWB ranges.
 
     Every range corrects the state on its own, through the lever arm and after height reduction, when
@@ -29,29 +28,8 @@ class Ekf(LidarOdometry):
     Source: chen2019 Eq. (3)-(20).
     """
 
-    class Config(LandmarkGate.Config, RangeGate.Config, LidarOdometry.Config):
+    class Config(FixTaker.Config, LidarOdometry.Config):
         """Settings of `ekf`."""
-
-    def __init__(self, config: Config, setup: Setup) -> None:
-        self._gate = RangeGate(config, setup)
-        self._landmark_gate = LandmarkGate(config, setup)
-        super().__init__(config, setup)
-
-    def update(self, measurement: Measurement) -> Report:
-        """Predict to the measurement's time and take it; scans only show what blocks ranges."""
-        if isinstance(measurement, RangeFrame):
-            if self._is_late(measurement.stamp_ns):
-                return Report((Verdict.LATE,) * len(measurement.ranges))
-            self._predict_to(measurement.stamp_ns)
-            return self._update_ranges(measurement)
-        if isinstance(measurement, LandmarkFrame):
-            if self._is_late(measurement.stamp_ns):
-                return Report((Verdict.LATE,))
-            self._predict_to(measurement.stamp_ns)
-            return Report((self._update_landmarks(measurement),))
-        report = super().update(measurement)
-        self._gate.see(measurement, self.pose_at)
-        return report
 
     def _place(self, pose: FloatArray, cov: FloatArray) -> None:
         super()._place(pose, cov)

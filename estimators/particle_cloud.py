@@ -15,12 +15,11 @@ import numpy as np
 from pydantic import Field
 
 from estimators.base import Report, Setup, Sketch, Verdict
-from estimators.landmark_gate import LandmarkGate
-from estimators.lidar.keyframes import START_SPEED_SIGMA, KeyframeTracker
+from estimators.fix_taker import FixTaker
+from estimators.lidar.keyframes import START_SPEED_SIGMA
 from estimators.messages import (
     FloatArray,
     LandmarkFrame,
-    Measurement,
     PoseEstimate,
     PoseIncrement,
     RangeFrame,
@@ -50,14 +49,14 @@ class Fixes:
         return self.misfits(particles, self.arm, self.ranges, self.landmarks)
 
 
-class ParticleCloud(KeyframeTracker):
+class ParticleCloud(FixTaker):
     """Motion, gating and output of every particle filter; how measurements change it is the subclass's.
 
     Every range of a frame, and every landmark, is gated by its NIS against the cloud before any of them
     counts.
     """
 
-    class Config(LandmarkGate.Config, RangeGate.Config, KeyframeTracker.Config):
+    class Config(FixTaker.Config):
         """Settings of every particle filter."""
 
         PARAMETER: ClassVar[str] = "particles"
@@ -73,8 +72,6 @@ class ParticleCloud(KeyframeTracker):
         self._cloud, self._likelihood, self._motion, self._scan = cloud, likelihood, motion, scan
         self._count = config.particles
         self._seed = config.seed
-        self._gate = RangeGate(config, setup)
-        self._landmark_gate = LandmarkGate(config, setup)
         self._arm = setup.tag_in_body
         self.reset()
 
@@ -96,22 +93,6 @@ class ParticleCloud(KeyframeTracker):
     def gate(self) -> RangeGate:
         """What judges ranges, for those who take up where the cloud leaves off."""
         return self._gate
-
-    def update(self, measurement: Measurement) -> Report:
-        """Predict to the measurement's time and take it; scans only show what blocks ranges."""
-        if isinstance(measurement, RangeFrame):
-            if self._is_late(measurement.stamp_ns):
-                return Report((Verdict.LATE,) * len(measurement.ranges))
-            self._predict_to(measurement.stamp_ns)
-            return self._update_ranges(measurement)
-        if isinstance(measurement, LandmarkFrame):
-            if self._is_late(measurement.stamp_ns):
-                return Report((Verdict.LATE,))
-            self._predict_to(measurement.stamp_ns)
-            return Report((self._update_landmarks(measurement),))
-        report = super().update(measurement)
-        self._gate.see(measurement, self.pose_at)
-        return report
 
     def pose_at(self, stamp_ns: int) -> PoseEstimate | None:
         """Mean and covariance, predicted with constant velocity; None before the first measurement."""

@@ -73,6 +73,10 @@ class KeyframeTracker(ABC):
         return Report((Verdict.NOT_USED,) * count)
 
     @abstractmethod
+    def pose_at(self, stamp_ns: int) -> PoseEstimate | None:
+        """Pose at an instant; None before the first measurement."""
+
+    @abstractmethod
     def _place(self, pose: FloatArray, cov: FloatArray) -> None:
         """Forget everything: the pose, which is the reference too, is this, and the speed zero."""
 
