@@ -321,5 +321,5 @@ def test_small_batches_draw_what_one_large_one_draws(
         ("error/position/ekf", "Scalars:scalars"),
         ("ranges/verdict/A1", "StateChange:state"),
     ):
-        rows = [dict(zip(r[entity]["time"], r[entity][component], strict=True)) for r in (small, recording)]
+        rows = [list(zip(r[entity]["time"], r[entity][component], strict=True)) for r in (small, recording)]
         assert str(rows[0]) == str(rows[1]), entity
