@@ -2,17 +2,18 @@
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
 import typer
 from rich import box
-from rich.console import Console
 from rich.table import Table
 
-from companion.calibration.ranges import Calibration
-from companion.config import Config, load_config
 from companion.errors import UserError
+from companion.terminal import message_console, result_console
+
+if TYPE_CHECKING:
+    from companion.calibration.ranges import Calibration
+    from companion.config import Config
 
 MAX_SPREAD, MIN_USED_SHARE = 0.2, 0.8
 """An anchor whose used errors scatter more than this [m], or with a smaller share used, was hidden."""
@@ -59,11 +60,14 @@ def ranges(
     the stay, in seconds since the log began), x, y, z (of the tag's antenna, in metres). The site file
     keeps its comments and its order.
     """
+    import numpy as np
+
     from companion.calibration.picture import residual_figure
     from companion.calibration.ranges import fit_biases, ranges_by_anchor
     from companion.calibration.recording import read_recording
     from companion.calibration.reference import tags_from_points, tags_from_truth
     from companion.calibration.site_file import write_range_bias
+    from companion.config import load_config
     from companion.log import Log
 
     config = load_config(site)
@@ -82,15 +86,20 @@ def ranges(
         if not by_anchor:
             raise UserError(f"{log}: no anchor has enough ranges where the position is known")
         found = fit_biases(by_anchor)
-    out = Console(highlight=False)
+    out = result_console()
     out.print(_range_table(found, config))
-    for anchor_id in _badly_seen(found):
-        Console(stderr=True, highlight=False).print(
+    err, badly_seen = message_console(), _badly_seen(found)
+    for anchor_id in badly_seen:
+        err.print(
             f"[yellow]anchor {anchor_id}: its errors scatter too much for noise, something stood before it; "
-            "calibrate in line of sight[/]",
-            soft_wrap=True,
+            "calibrate in line of sight[/]"
         )
     residual_figure(found, picture, f"{config.site.name}: ranges of {log.name}")
+    if badly_seen and against == "lidar":
+        # Poses and biases were found together: one wrong anchor shifts the way, and with it all biases.
+        err.print(f"  picture {picture}")
+        err.print("[red]nothing written: without known positions one hidden anchor spoils the bias of all[/]")
+        raise typer.Exit(1)
     write_range_bias(site, found, to or site)
     out.print(f"  common bias {found.common:+.4f} +- {found.common_sigma:.4f} m, {found.common_ns:+.2f} ns")
     out.print(f"  written to {to or site}, table range_bias", soft_wrap=True)
@@ -107,6 +116,7 @@ def mounting(log: Log_, site: Site, until: Until = None, figures: Json = None) -
     """
     from companion.calibration.drive import mounting_on_drive
     from companion.calibration.recording import read_recording
+    from companion.config import load_config
     from companion.log import Log
 
     config = load_config(site)
@@ -119,7 +129,7 @@ def mounting(log: Log_, site: Site, until: Until = None, figures: Json = None) -
         table.add_row(f"body.tag {axis}", *row)
     delay = (f"{found.delay * 1e3:.1f}", f"{found.delay_sigma * 1e3:.1f}", "ms")
     table.add_row("ranges stamped late by", "0.0", *delay)
-    out = Console(highlight=False)
+    out = result_console()
     out.print(table)
     sensor = "UWB" if found.delay >= 0.0 else "LiDAR"
     out.print(
@@ -136,7 +146,7 @@ def mounting(log: Log_, site: Site, until: Until = None, figures: Json = None) -
     )
 
 
-def _badly_seen(found: Calibration) -> list[int]:
+def _badly_seen(found: "Calibration") -> list[int]:
     """Anchors whose errors scatter more than noise does, or of whose ranges many were left out."""
     return [
         anchor_id
@@ -145,7 +155,9 @@ def _badly_seen(found: Calibration) -> list[int]:
     ]
 
 
-def _range_table(found: Calibration, config: Config) -> Table:
+def _range_table(found: "Calibration", config: "Config") -> Table:
+    import numpy as np
+
     table = Table(
         title=f"{config.site.name}: range minus distance",
         title_justify="left",
@@ -177,7 +189,7 @@ def _range_table(found: Calibration, config: Config) -> Table:
     return table
 
 
-def _range_figures(found: Calibration) -> dict[str, object]:
+def _range_figures(found: "Calibration") -> dict[str, object]:
     return {
         "common_m": found.common,
         "common_sigma_m": found.common_sigma,

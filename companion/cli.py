@@ -5,18 +5,14 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from datetime import datetime
 from math import degrees
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
-from rich.console import Console
 from rich.logging import RichHandler
 from rich.markup import escape
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 from typer.core import TyperGroup
 
 from companion import __version__
@@ -24,10 +20,12 @@ from companion.calibrate_cli import app as calibrate_app
 from companion.doctor import app as doctor
 from companion.errors import UserError
 from companion.evaluate_cli import app as evaluate_app
+from companion.log_cli import edit, export, import_recording, make_map
 from companion.params_cli import app as params_app
 from companion.review_cli import review
 from companion.sitl_cli import sitl
 from companion.smooth_cli import smooth
+from companion.terminal import Seed, Sets, message_console, progress, result_console
 
 if TYPE_CHECKING:
     from companion.config import Config
@@ -65,14 +63,14 @@ app.command()(sitl)
 app.add_typer(evaluate_app, name="evaluate", cls=_ScenarioUnlessNamed)
 app.command()(smooth)
 app.command()(review)
-out = Console(emoji=False)
-err = Console(stderr=True, highlight=False, emoji=False)
+app.command("map")(make_map)
+app.command()(edit)
+app.command("import")(import_recording)
+app.command()(export)
+out, err = result_console(), message_console()
 
 Scenario_ = Annotated[
     str, typer.Argument(metavar="SCENARIO", help="Scenario file, or the name of one in params/scenarios.")
-]
-Seed = Annotated[
-    int | None, typer.Option("--seed", min=0, metavar="N", help="Instead of the scenario's own seed.")
 ]
 View = Annotated[
     str,
@@ -81,14 +79,6 @@ View = Annotated[
         metavar="WHERE",
         help="Show it in Rerun: web (a page for a browser, see the table view), native (a window on this "
         "computer) or off. `run` shows it while it runs.",
-    ),
-]
-Sets = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--set",
-        metavar="KEY=VALUE",
-        help="Change one setting of the site, e.g. --set pipeline.rate=20. Repeatable.",
     ),
 ]
 
@@ -122,37 +112,34 @@ def demo(
     from companion.tables import accuracy_table, anchor_table, sensor_lines
 
     loaded = _load_scenario(scenario, seed, sets)
-    with _progress() as progress:
-        bars = {name: progress.add_task(name, total=1.0) for name in ("walk", "replay", "pictures")}
+    with progress(err) as shown:
+        bars = {name: shown.add_task(name, total=1.0) for name in ("walk", "replay", "pictures")}
         result, received = run_demo(
-            loaded, folder, lambda stage, share: progress.update(bars[stage], completed=share)
+            loaded, folder, lambda stage, share: shown.update(bars[stage], completed=share)
         )
     out.print(f"[bold]{loaded.file.description}[/]" if loaded.file.description else loaded.name)
     out.print(accuracy_table(result, f"{result.duration:.0f} s against truth, seed {loaded.seed}"))
     out.print(anchor_table(result))
     for line in sensor_lines(result):
-        out.print(f"  {line}", highlight=False)
+        out.print(f"  {line}")
     definite = "all" if received.all_positive_definite else "NOT ALL"
     out.print(
         f"  autopilot: {received.poses} poses at {received.rate:.1f} Hz, {received.heartbeats} heartbeats, "
         f"covariance {definite} positive definite",
-        highlight=False,
         soft_wrap=True,
     )
-    out.print(
-        f"  replay: repeats the poses sent to {received.replay_difference * 1000:.3f} mm", highlight=False
-    )
+    out.print(f"  replay: repeats the poses sent to {received.replay_difference * 1000:.3f} mm")
     out.print()
-    out.print(f"  picture  {folder / 'demo.png'}", highlight=False)
-    out.print(f"  log      {folder / 'raw.mcap'}", highlight=False)
-    out.print(f"  review   companion review {folder}", highlight=False)
-    shown = _shown(view)
-    if shown != "off":
+    out.print(f"  picture  {folder / 'demo.png'}")
+    out.print(f"  log      {folder / 'raw.mcap'}")
+    out.print(f"  review   companion review {folder}")
+    where = _shown(view)
+    if where != "off":
         from companion.view.viewer import Viewer
 
-        viewer = Viewer(shown, loaded.config.view, folder / "replay.rrd")
+        viewer = Viewer(where, loaded.config.view, folder / "replay.rrd")
         if viewer.is_page:
-            err.print(f"open {viewer.page}; served until Ctrl-C", soft_wrap=True)
+            err.print(f"open {viewer.page}; served until Ctrl-C")
             viewer.serve_until_interrupted()
 
 
@@ -191,7 +178,7 @@ def run(
     begin = time.monotonic()
 
     def say(line: str) -> None:
-        err.print(f"[dim]{time.monotonic() - begin:8.1f}[/]  {escape(line)}", soft_wrap=True)
+        err.print(f"[dim]{time.monotonic() - begin:8.1f}[/]  {escape(line)}")
 
     live = LiveRun(config, folder, say, view=_shown(view))
     say(f"{config.site.name}: estimator {config.pipeline.estimator}, log {folder / 'raw.mcap'}")
@@ -218,12 +205,12 @@ def simulate(
     from companion.sim.simulate import simulate as write_log
 
     loaded = _load_scenario(scenario, seed, sets)
-    with _progress() as progress:
-        bar = progress.add_task(loaded.name, total=1.0)
+    with progress(err) as shown:
+        bar = shown.add_task(loaded.name, total=1.0)
         for share in write_log(loaded, log):
-            progress.update(bar, completed=share)
-        progress.update(bar, completed=1.0)
-    out.print(f"{log}  {loaded.trajectory.duration:.0f} s, seed {loaded.seed}", highlight=False)
+            shown.update(bar, completed=share)
+        shown.update(bar, completed=1.0)
+    out.print(f"{log}  {loaded.trajectory.duration:.0f} s, seed {loaded.seed}")
 
 
 @app.command()
@@ -237,12 +224,12 @@ def emulate(scenario: Scenario_, seed: Seed = None, sets: Sets = None) -> None:
     loaded = _load_scenario(scenario, seed, sets)
     emulator = Emulator(loaded)
     for name, port in emulator.ports.items():
-        out.print(f"{name}  {port.path}", highlight=False)
+        out.print(f"{name}  {port.path}")
     out.file.flush()
     options = " ".join(f"--set sensor.{name}.port={port.path}" for name, port in emulator.ports.items())
     site = _scenario_path(scenario).parent / loaded.file.site
     err.print("In another terminal:")
-    err.print(f"  companion run --site {site.resolve()} {options}", soft_wrap=True)
+    err.print(f"  companion run --site {site.resolve()} {options}")
     stop = threading.Event()
     _stop_on_signal(stop)
     try:
@@ -305,18 +292,18 @@ def replay(
     folder = folder or Path("out") / log.stem
     view = RerunFiles(config, names, folder / "replay.rrd", opened.start_ns)
     begin = time.perf_counter()
-    with _progress() as progress:
-        bar = progress.add_task(log.name, total=1.0)
+    with progress(err) as shown:
+        bar = shown.add_task(log.name, total=1.0)
         result = run_log(
             opened,
             config,
             names,
             view.tick,
-            lambda share: progress.update(bar, completed=share),
-            view.chunk,
+            lambda share: shown.update(bar, completed=share),
+            on_chunk=view.chunk,
         )
         view.close()
-        progress.update(bar, completed=1.0)
+        shown.update(bar, completed=1.0)
     took = time.perf_counter() - begin
     write_outputs(result, folder)
     if not result.complete:
@@ -325,84 +312,10 @@ def replay(
     out.print(accuracy_table(result, title + ("" if result.errors else ", no truth in the log")))
     out.print(anchor_table(result))
     for line in sensor_lines(result):
-        out.print(f"  {line}", highlight=False)
+        out.print(f"  {line}")
     out.print(
         f"  written to {folder}: poses.tum, ranges.csv, summary.json, config.toml, replay.rrd",
-        highlight=False,
     )
-
-
-@app.command("map")
-def make_map(
-    log: Annotated[Path, typer.Argument(metavar="LOG", help="Log (MCAP) of a run, demo or simulation.")],
-    out_file: Annotated[
-        Path, typer.Option("--out", metavar="FILE", help="Map (YAML) to write, with a PNG beside it.")
-    ] = Path("map.yaml"),
-    estimator: Annotated[
-        str | None,
-        typer.Option("--estimator", metavar="NAME", help="Whose poses are used. Default: the log's."),
-    ] = None,
-    sets: Sets = None,
-) -> None:
-    """Make a floor plan of what the LiDAR saw in a log, as a picture and a YAML file.
-
-    The files follow the convention of the ROS map_server, which other tools read, too.
-    """
-    from companion.log import Log
-    from companion.map_file import save_map
-    from companion.mapping import survey
-    from companion.replay import config_of
-    from estimators import ESTIMATORS
-
-    if out_file.suffix not in (".yaml", ".yml"):
-        raise UserError(f"--out {out_file}: the name must end in .yaml")
-    opened = Log(log)
-    config = config_of(opened, sets or [])
-    name = estimator or config.pipeline.estimator
-    if name not in ESTIMATORS:
-        raise UserError(f"--estimator: unknown estimator {name!r}, there are: {', '.join(ESTIMATORS)}")
-    with _progress() as progress:
-        bar = progress.add_task(log.name, total=1.0)
-        made = survey(opened, config, name, lambda share: progress.update(bar, completed=share))
-        progress.update(bar, completed=1.0)
-    save_map(made.floor, out_file)
-    rows, columns = made.floor.occupied.shape
-    cell = made.floor.cell
-    out.print(
-        f"{out_file}  {columns * cell:.1f} m x {rows * cell:.1f} m in cells of {cell:g} m, "
-        f"{made.inserted} of {made.scans} scans",
-        highlight=False,
-        soft_wrap=True,
-    )
-
-
-@app.command()
-def edit(
-    log: Annotated[Path, typer.Argument(metavar="LOG", help="Log (MCAP) to read.")],
-    fault: Annotated[
-        list[str],
-        typer.Option("--fault", metavar="KIND:KEY=VALUE,...", help="What goes wrong. Repeatable."),
-    ],
-    path: Annotated[Path, typer.Option("--out", metavar="LOG", help="Log (MCAP) to write.")],
-    seed: Seed = None,
-) -> None:
-    """Write a log as it would be had something gone wrong: what if anchor 3 dies at 20 s?
-
-    [bold]companion edit raw.mcap --fault drop:anchor=3,at=20 --out what_if.mcap[/], then replay what_if.mcap.
-    Every fault has at= and for= [s]. silent (sensor), late (sensor, by [s]), drop (anchor), spike (anchor,
-    size [m], share), nlos (anchor, least, mean [m]), moved (anchor, x, y, z [m]; needs truth), clock (by [s]:
-    the tag's clock jumps), rotated (yaw_deg: the tag in its mount), blocked (from_deg, to_deg, distance: a
-    sector of the LiDAR), gone (share of LiDAR beams without return).
-    """
-    from companion.log import Log
-    from companion.log_edit.edit import edit_log
-    from companion.log_edit.faults import parse_fault
-    from companion.replay import config_of
-
-    opened = Log(log)
-    config = config_of(opened, [])
-    edit_log(opened, config, [parse_fault(text, config) for text in fault], seed or 0, path)
-    out.print(f"{path}  replay it with: companion replay {path}", highlight=False, soft_wrap=True)
 
 
 @app.command()
@@ -441,56 +354,8 @@ def plan(
     layout = plan_layout(config, world, limit, sigma)
     plan_figure(layout, config, folder / "plan.png")
     for line in layout.lines():
-        out.print(line, highlight=False, soft_wrap=True)
-    out.print(f"picture  {folder / 'plan.png'}", highlight=False, soft_wrap=True)
-
-
-@app.command("import")
-def import_recording(
-    source: Annotated[
-        Path,
-        typer.Argument(
-            metavar="SOURCE",
-            help="Folder of a public data set (lias_planar, labyrinth_uwb, robotino_uwb) or of text files as "
-            "export writes them, CARMEN log, ROS 1 or 2 bag.",
-        ),
-    ],
-    path: Annotated[Path, typer.Option("--out", metavar="LOG", help="Log (MCAP) to write.")],
-    site: Annotated[
-        Path | None,
-        typer.Option("--site", metavar="FILE", help="Site file; we have one for each of the data sets."),
-    ] = None,
-    truth: Annotated[
-        str | None,
-        typer.Option("--truth", metavar="TOPIC", help="Odometry or PoseStamped of a bag to compare with."),
-    ] = None,
-    sets: Sets = None,
-) -> None:
-    """Make a log of somebody else's recording, in the bytes that our sensors would have sent.
-
-    Ranges become LinkTrack frames, scans RPLIDAR packets: replay and evaluate take the one path that a
-    robot takes.
-    """
-    from companion.config import named_file
-    from companion.importers.sources import import_log
-
-    count = import_log(source, path, site and named_file(site, "sites"), sets, truth)
-    out.print(f"{path}  {count} measurements", highlight=False, soft_wrap=True)
-
-
-@app.command()
-def export(
-    log: Annotated[Path, typer.Argument(metavar="LOG", help="Log (MCAP).")],
-    folder: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to write.")],
-) -> None:
-    """Write what a log holds as text: ranges.csv, scans.csv, imu.csv, truth.tum."""
-    from companion.importers.text_folder import write_folder
-    from companion.log import Log
-    from companion.replay import config_of
-
-    opened = Log(log)
-    for path in write_folder(opened, config_of(opened, []), folder):
-        out.print(str(path), highlight=False, soft_wrap=True)
+        out.print(line, soft_wrap=True)
+    out.print(f"picture  {folder / 'plan.png'}", soft_wrap=True)
 
 
 @app.command("dump-config")
@@ -519,7 +384,7 @@ def main() -> NoReturn:
     try:
         app()
     except UserError as error:
-        err.print("[red]error:[/]", escape(str(error)), soft_wrap=True)
+        err.print("[red]error:[/]", escape(str(error)))
         sys.exit(EXIT_BAD_INPUT)
     sys.exit(0)
 
@@ -548,29 +413,15 @@ def _load_scenario(name: str, seed: int | None, sets: list[str] | None) -> "Scen
     return scenario
 
 
-@contextmanager
-def _progress() -> Iterator[Progress]:
-    with Progress(
-        TextColumn("{task.description:>9}"),
-        BarColumn(),
-        TaskProgressColumn(),
-        TimeRemainingColumn(),
-        console=err,
-        transient=True,
-        disable=not err.is_terminal,
-    ) as progress:
-        yield progress
-
-
 def _play(log: "Log", config: "Config", primary: str, speed: float) -> None:
     """Send a log's poses to an autopilot and print how well it followed."""
     from companion.replay_out import Player
 
-    player = Player(log, config, primary, speed, lambda line: err.print(line, markup=False, soft_wrap=True))
+    player = Player(log, config, primary, speed, lambda line: err.print(line, markup=False))
     player.play()
-    out.print(f"{player.poses_sent} poses sent", highlight=False)
+    out.print(f"{player.poses_sent} poses sent")
     for line in player.score.lines():
-        out.print(line, highlight=False, markup=False, soft_wrap=True)
+        out.print(line, markup=False, soft_wrap=True)
 
 
 def _stop_on_signal(stop: threading.Event) -> None:
@@ -586,7 +437,7 @@ def _report(live: "LiveRun", stop: threading.Event) -> None:
                 status.update(_status_line(live.status))
     else:
         while not stop.wait(5.0):
-            err.print(_status_line(live.status), soft_wrap=True)
+            err.print(_status_line(live.status))
 
 
 def _status_line(status: "LiveStatus") -> str:

@@ -28,6 +28,9 @@ from drivers.errors import PortError
 from drivers.port import parse_address
 from estimators import ESTIMATORS, estimator_config_class
 from estimators.base import Setup, Start
+from estimators.lidar.ekf_slam import EkfSlam
+from estimators.lidar.front_ends import FRONT_ENDS
+from estimators.lidar.loop_closure import LoopCloser
 from estimators.lidar.scan_matching import ScanMatcher
 from estimators.lidar.scan_preparation import ScanPreparation
 from estimators.messages import FloatArray
@@ -174,6 +177,7 @@ class PipelineTable(Table):
     """How measurements are ordered and poses given out."""
 
     estimator: str = Field("ekf", description="whose pose goes to the autopilot")
+    front_end: str = Field("scan_matcher", description="what makes increments of scans")
     rate: float = Field(30.0, ge=4, le=50, description="poses a second [Hz]")
     hold_ms: float = Field(
         30.0, ge=0, le=1000, description="wait this long for slower sensors, to keep stamp order [ms]"
@@ -183,6 +187,11 @@ class PipelineTable(Table):
     @classmethod
     def _known_estimator(cls, name: str) -> str:
         return known(name, ESTIMATORS, "estimator")
+
+    @field_validator("front_end")
+    @classmethod
+    def _known_front_end(cls, name: str) -> str:
+        return known(name, FRONT_ENDS, "front end")
 
 
 class HealthTable(Table):
@@ -247,6 +256,8 @@ class Config(Table):
     pipeline: PipelineTable = Field(default_factory=PipelineTable)
     scan_preparation: ScanPreparation.Config = Field(default_factory=ScanPreparation.Config)
     scan_matcher: ScanMatcher.Config = Field(default_factory=ScanMatcher.Config)
+    loop_closure: LoopCloser.Config = Field(default_factory=LoopCloser.Config)
+    ekf_slam: EkfSlam.Config = Field(default_factory=EkfSlam.Config)
     estimator: Any = Field(
         default_factory=dict, validate_default=True, description="a table for each estimator, by name"
     )
@@ -273,10 +284,13 @@ class Config(Table):
                 'raw_ranges give anchors by latitude and longitude: set site.origin, align = "site"'
             )
         has_lidar = any(table.driver == "rplidar" for table in info.data.get("sensor", {}).values())
-        if has_lidar and (mavlink.inputs.odometry or mavlink.inputs.wheels):
+        if mavlink.obstacles and not has_lidar:
+            raise ValueError("obstacles come from a LiDAR, and the site has none: set obstacles = false")
+        is_matched = "pipeline" not in info.data or info.data["pipeline"].front_end == "scan_matcher"
+        if (mavlink.inputs.odometry or mavlink.inputs.wheels) and not is_matched:
             raise ValueError(
-                "increments of a LiDAR and of the autopilot's link cannot be chained: set inputs.odometry "
-                "and inputs.wheels to 0, or leave the LiDAR out of the site"
+                'inputs.odometry and inputs.wheels need pipeline.front_end = "scan_matcher": '
+                "EKF-SLAM takes scans alone"
             )
         return mavlink
 
@@ -302,6 +316,12 @@ class Config(Table):
     def estimator_config(self, name: str) -> BaseModel:
         """Settings of the named estimator."""
         config = getattr(self.estimator, name)
+        assert isinstance(config, BaseModel)
+        return config
+
+    def front_end_config(self) -> BaseModel:
+        """Settings of the chosen front end."""
+        config = getattr(self, self.pipeline.front_end)
         assert isinstance(config, BaseModel)
         return config
 
@@ -455,7 +475,7 @@ def named_file(path: Path, kind: str) -> Path:
     """A file of the user's, or one of ours in `params/KIND` by its bare name.
 
     Raises:
-        UserError: a bare name that neither has.
+        UserError: a bare name that neither has; names ours.
     """
     if path.exists() or path.suffix or path.name != str(path):
         return path

@@ -45,6 +45,8 @@ class Errors:
         truth: (N, 3) the same, true; yaw NaN where the reference has none.
         error: (N, 3) estimate minus truth, yaw wrapped.
         cov: (N, 3, 3) claimed covariance of (x, y, yaw).
+        height: (N,) estimated z of the body [m].
+        height_variance: (N,) claimed variance of the same [m^2]; infinite where ranges cannot show it.
         availability: share of the instants with truth at which there was a pose.
     """
 
@@ -53,6 +55,8 @@ class Errors:
     truth: FloatArray
     error: FloatArray
     cov: FloatArray
+    height: FloatArray
+    height_variance: FloatArray
     availability: float
 
     @property
@@ -144,5 +148,7 @@ def compare(poses: Sequence[PoseEstimate], reference: Reference, ticks_with_trut
         truth=truth,
         error=error,
         cov=np.array([pose.planar_cov for pose in covered]).reshape(-1, 3, 3),
+        height=np.array([pose.T_map_body[2, 3] for pose in covered]),
+        height_variance=np.array([pose.cov[2, 2] for pose in covered]),
         availability=len(covered) / ticks_with_truth if ticks_with_truth else 0.0,
     )

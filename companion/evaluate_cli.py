@@ -10,11 +10,10 @@ from tempfile import mkdtemp
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from companion.alignment import Alignment
 from companion.errors import UserError
+from companion.terminal import Seed, Sets, message_console, progress, result_console
 
 if TYPE_CHECKING:
     from companion.evaluation import Evaluation
@@ -37,9 +36,7 @@ def scenario(
     trials: Annotated[
         int, typer.Option("--trials", min=1, metavar="N", help="Number of runs of each scenario.")
     ] = 30,
-    seed: Annotated[
-        int | None, typer.Option("--seed", min=0, metavar="N", help="Instead of the scenario's own seed.")
-    ] = None,
+    seed: Seed = None,
     estimators: Annotated[
         str | None,
         typer.Option(
@@ -82,12 +79,7 @@ def scenario(
             "library: one evaluation for every sort of fault.",
         ),
     ] = None,
-    sets: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--set", metavar="KEY=VALUE", help="Change one setting of the site, e.g. --set pipeline.rate=20."
-        ),
-    ] = None,
+    sets: Sets = None,
 ) -> None:
     """Measure estimators on many trials of scenarios, or on logs: errors, consistency, time, integrity.
 
@@ -101,7 +93,7 @@ def scenario(
     from companion.evaluation_table import evaluation_notes, evaluation_table, leg_table, trust_table
     from companion.log_trial import LOG_SUFFIX
 
-    out, err = Console(emoji=False), Console(stderr=True, highlight=False, soft_wrap=True, emoji=False)
+    out, err = result_console(), message_console()
     if not out.is_terminal:
         out.width = max(out.width, _TABLE_WIDTH)
     choices = DEFAULT_CHOICES if estimators is None else estimators.split(",")
@@ -112,9 +104,9 @@ def scenario(
     paths = [_imported(named_file(Path(source), "scenarios"), sets or []) for source in sources]
     results: list[Evaluation] = []
     for path, faults in _runs(paths, fault or [], sets or []):
-        with _progress(err) as progress:
+        with progress(err, counts=True) as shown:
             count = 1 if path.suffix == LOG_SUFFIX and not faults else trials
-            bar = progress.add_task(path.stem, total=count)
+            bar = shown.add_task(path.stem, total=count)
             results.append(
                 evaluate_scenario(
                     path,
@@ -123,7 +115,7 @@ def scenario(
                     choices,
                     sets or [],
                     workers or os.cpu_count() or 1,
-                    partial(progress.advance, bar),
+                    partial(shown.advance, bar),
                     align,
                     scheduler,
                     faults,
@@ -135,10 +127,10 @@ def scenario(
         if (legs := leg_table(result)) is not None:
             out.print(legs)
         for line in evaluation_notes(result):
-            out.print(f"  {line}", highlight=False, soft_wrap=True)
+            out.print(f"  {line}", soft_wrap=True)
         if folder is not None:
             for line in _write_report(results, path, folder, sets or [], faults):
-                out.print(f"  {line}", highlight=False, soft_wrap=True)
+                out.print(f"  {line}", soft_wrap=True)
         if result.interrupted:
             err.print(f"[yellow]interrupted: {path} has {result.trials} of {count} trials[/]")
             break
@@ -228,8 +220,7 @@ def functions(
     from companion.function_benchmark.report import convergence_figure, outcome_table, verdict
     from companion.function_benchmark.rivals import RIVALS, missing
 
-    err = Console(stderr=True, highlight=False, soft_wrap=True)
-    out = Console(highlight=False)
+    out, err = result_console(), message_console()
     contenders = list(CONTENDERS)
     _make_writable(folder / "convergence_original.png", *([figures] if figures else []))
     if absent := missing():
@@ -239,9 +230,9 @@ def functions(
         )
         contenders = [name for name in contenders if name not in RIVALS]
     count = trials * len(Setting) * len(contenders) * len(FUNCTIONS)
-    with _progress(err) as progress:
-        bar = progress.add_task("runs", total=count)
-        race = run_race(contenders, trials, seed, os.cpu_count() or 1, lambda: progress.advance(bar))
+    with progress(err, counts=True) as shown:
+        bar = shown.add_task("runs", total=count)
+        race = run_race(contenders, trials, seed, os.cpu_count() or 1, lambda: shown.advance(bar))
     for setting in Setting:
         out.print(outcome_table(race, setting))
         picture = folder / f"convergence_{setting}.png"
@@ -250,19 +241,6 @@ def functions(
     out.print(verdict(race), soft_wrap=True)
     if figures is not None:
         figures.write_text(json.dumps(race.to_json(), indent=2) + "\n", encoding="utf-8")
-
-
-def _progress(err: Console) -> Progress:
-    """A bar on a terminal, with what is done and the time left."""
-    return Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-        console=err,
-        transient=True,
-        disable=not err.is_terminal,
-    )
 
 
 def _make_writable(*paths: Path) -> None:

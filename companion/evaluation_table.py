@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 
+import numpy as np
 from rich import box
 from rich.table import Table
 
@@ -89,12 +90,32 @@ def evaluation_notes(result: Evaluation) -> list[str]:
         for name, figures in result.estimators.items()
         if figures and figures.ranges and figures.ranges["biased"]
     ]
+    notes += [note for name in result.errors if (note := _height_note(result, name)) is not None]
     notes += [
         f"{name}: {mean.iterations:.1f} iterations of its solver for a frame"
         for name, mean in result.estimators.items()
         if mean is not None and mean.iterations is not None
     ]
     return notes
+
+
+def _height_note(result: Evaluation, name: str) -> str | None:
+    """What an estimator says of the height; None when it takes the site's for granted."""
+    errors, body = list(result.errors[name].values()), result.config.body
+    if not errors:
+        return None
+    variances = np.concatenate([each.height_variance for each in errors])
+    observed = np.isfinite(variances)
+    if np.allclose(variances, body.height_sigma**2):
+        return None
+    if not observed.any():
+        return f"{name}: height unobservable, the anchors lie in one plane; the site's is kept"
+    off = np.concatenate([each.height for each in errors])[observed] - body.height
+    return (
+        f"{name}: height from ranges at {observed.mean():.1%} of the poses, RMSE "
+        f"{np.sqrt((off**2).mean()):.3f} m against the site's, claimed "
+        f"{np.sqrt(variances[observed].mean()):.3f} m"
+    )
 
 
 def _range_note(name: str, ranges: Mapping[str, float | int | None]) -> str:

@@ -70,19 +70,21 @@ def judge_compass(ours: float, autopilots: float) -> Finding:
         autopilots: of its ATTITUDE [rad].
     """
     off = degrees(wrap_angle(autopilots - ours))
-    text = f"compass: autopilot {degrees(autopilots) % 360:.0f} deg, ours {degrees(ours) % 360:.0f} deg"
+    text = f"compass: autopilot {round(degrees(autopilots)) % 360} deg, ours {round(degrees(ours)) % 360} deg"
     if abs(off) <= MAX_COMPASS_DEG:
         return Finding(True, f"{text}: agrees")
     return Finding(False, f"{text}: if the compass is right, add {off:+.0f} deg to site.map_heading_deg")
 
 
-def judge_autopilot(ours: FloatArray, autopilots: FloatArray) -> Finding:
+def judge_autopilot(ours: FloatArray, autopilots: FloatArray | None) -> Finding:
     """Compare a displacement in north and east with the autopilot's own.
 
     Args:
         ours: (2,) north, east [m].
-        autopilots: (2,) of its LOCAL_POSITION_NED [m].
+        autopilots: (2,) of its LOCAL_POSITION_NED [m]; None when it had none at the beginning.
     """
+    if autopilots is None:
+        return Finding(None, "autopilot: it had no position when the walk began, it did not use our pose yet")
     length = float(hypot(*autopilots))
     if length < LEAST_WALK or hypot(*ours) < LEAST_WALK:
         return Finding(None, "autopilot: its position did not move, it does not use our pose (yet)")

@@ -12,6 +12,8 @@ from estimators.messages import Measurement, PoseEstimate, PoseIncrement, RangeF
 
 MEMORY = 2.0
 """Time constant [s] over which the shares of accepted and of too short ranges are remembered."""
+LONGEST_BRIEF = 35
+"""Characters of a reason that fits, behind the state, into the 50 of a text to the pilot."""
 REGAIN = 1.5
 """Agreement of ranges and pose must be better by this factor to be reached than to be kept."""
 _DISAGREES = frozenset({Verdict.GATED, Verdict.TOO_LONG, Verdict.DOWNWEIGHTED})
@@ -37,10 +39,12 @@ class Health:
     Attributes:
         state: see `State`.
         reason: one line for the operator; empty when all is well.
+        brief: the same for the pilot, in `LONGEST_BRIEF` characters; empty when `reason` is as short.
     """
 
     state: State
     reason: str
+    brief: str = ""
 
     @property
     def sends(self) -> bool:
@@ -82,11 +86,27 @@ class AnchorState:
         return "NLOS" if Verdict(self.reason).is_nlos else self.reason
 
 
-def uwb_line(anchors: Sequence[AnchorState]) -> str:
-    """One line for the operator: how many anchors are used, and what is wrong with the others."""
-    used = sum(anchor.is_used for anchor in anchors)
-    others = [f", A{anchor.anchor_id} {anchor.trouble}" for anchor in anchors if not anchor.is_used]
-    return f"UWB: {used} of {len(anchors)} anchors" + "".join(others)
+def uwb_line(anchors: Sequence[AnchorState], longest: int | None = None) -> str:
+    """One line for the operator: how many anchors are used, and what is wrong with the others.
+
+    Args:
+        anchors: of the site.
+        longest: characters that it may have; where there is no room for names, anchors are counted.
+    """
+    others: dict[str, list[str]] = {}
+    for anchor in anchors:
+        if not anchor.is_used:
+            others.setdefault(anchor.trouble, []).append(f"A{anchor.anchor_id}")
+    used, count = sum(anchor.is_used for anchor in anchors), len(anchors)
+    named = [f"{' '.join(names)} {trouble}" for trouble, names in others.items()]
+    counted = [f"{len(names)} {trouble}" for trouble, names in others.items()]
+    lines = (
+        ", ".join([f"UWB: {used} of {count} anchors", *named]),
+        f"UWB {used}/{count}: " + ", ".join(named),
+        f"UWB {used}/{count}: " + ", ".join(counted),
+        f"UWB: {used} of {count} anchors",
+    )
+    return next((line for line in lines if longest is None or len(line) <= longest), lines[-1])
 
 
 class HealthMonitor:
@@ -115,6 +135,7 @@ class HealthMonitor:
         self._has_ranges = has_ranges
         self._has_scans = has_scans
         self._used = 6 if needs_heading else 5
+        self._heading_advice = "" if has_scans else "without LiDAR or odometry set mavlink.heading = false"
         self._resets = 0
         self._accepted_share: float
         self._short_share: float
@@ -205,48 +226,71 @@ class HealthMonitor:
         """State at `now_ns` for the pose that would be sent."""
         table = self._table
         if pose is None:
-            return Health(State.STARTING, self._note or "no pose yet: waiting for measurements")
+            if self._note:
+                return Health(State.STARTING, f"looking for the pose: {self._note}", self._note)
+            return Health(State.STARTING, "no pose yet: waiting for measurements", "waiting for measurements")
         if pose.reset_counter != self._resets:
             self._resets = pose.reset_counter
             self._begin_agreement()
         sources = self._sources(now_ns)
         awaited = [s.what for s in sources if s.first_awaited and not s.is_stale]
         if awaited:
-            return Health(State.STARTING, f"waiting for the first {awaited[0]}")
+            return Health(State.STARTING, f"waiting for a {awaited[0]}")
         cov = pose.cov[: self._used, : self._used]
         if np.isposinf(pose.cov[5, 5]) and self._used == 6:
-            return Health(State.LOST, f"heading not known: {self._note or 'start again on the start mark'}")
+            what = self._note or self._heading_advice or "start again on the start mark"
+            return Health(State.LOST, f"heading not known: {what}", self._note or "heading not known")
         if not (np.isfinite(pose.T_map_body).all() and np.isfinite(cov).all()):
             return Health(State.LOST, "pose or covariance is not finite")
         if np.linalg.eigvalsh(cov)[0] <= 0.0:
             return Health(State.LOST, "covariance is not positive definite")
         sigma_xy = float(np.sqrt(np.linalg.eigvalsh(pose.cov[:2, :2])[1]))
         if sigma_xy > table.max_sigma_xy:
-            return Health(State.LOST, f"position sigma {sigma_xy:.2f} m above {table.max_sigma_xy:g} m")
+            what = f"position sigma {sigma_xy:.2f} m"
+            return Health(State.LOST, f"{what} above {table.max_sigma_xy:g} m", what)
         sigma_yaw = float(np.rad2deg(np.sqrt(pose.cov[5, 5])))
         if self._used == 6 and sigma_yaw > table.max_sigma_yaw_deg:
-            return Health(
-                State.LOST, f"heading sigma {sigma_yaw:.0f} deg above {table.max_sigma_yaw_deg:g} deg"
-            )
+            what = f"heading sigma {sigma_yaw:.0f} deg"
+            why = f"{what} above {table.max_sigma_yaw_deg:g} deg"
+            return Health(State.LOST, ": ".join(filter(None, (why, self._heading_advice))), what)
         if self._has_ranges and not self._agrees:
-            return self._disagreement()
-        stale = [f"no {s.what} accepted for {s.age:.1f} s" for s in sources if s.is_stale]
-        dead_reckoned = self._has_ranges and sources[0].is_stale and sources[0].age > table.max_dead_reckoning
-        if len(stale) == len(sources) or dead_reckoned:
-            return Health(State.LOST, "; ".join(stale))
-        return Health(State.DEGRADED, stale[0]) if stale else Health(State.OK, "")
+            return self._disagreement(now_ns)
+        stale = [s for s in sources if s.is_stale]
+        if not stale:
+            return Health(State.OK, "")
+        reason = "; ".join(f"no {s.what} accepted for {s.age:.1f} s" for s in stale)
+        brief = f"no {' and no '.join(s.what for s in stale)}"
+        if self._has_ranges and stale == sources[:1]:
+            brief = self._uwb_brief(now_ns, brief)
+        dead_reckoned = (
+            self._has_ranges and stale[0] is sources[0] and stale[0].age > table.max_dead_reckoning
+        )
+        is_lost = len(stale) == len(sources) or dead_reckoned
+        return Health(State.LOST if is_lost else State.DEGRADED, reason, brief)
 
-    def _disagreement(self) -> Health:
+    def _uwb_brief(self, now_ns: int, otherwise: str) -> str:
+        """What is wrong with the anchors, for the pilot; something else where none is known."""
+        anchors = self.anchors(now_ns)
+        return uwb_line(anchors, LONGEST_BRIEF) if anchors else otherwise
+
+    def _disagreement(self, now_ns: int) -> Health:
         if self._share_stamp_ns is None:
-            return Health(State.STARTING, "no range yet that could confirm the start pose")
+            why = "no range yet that could confirm the start pose"
+            return Health(State.STARTING, why, "no range to confirm the start")
         shares = (
             f"{self._accepted_share:.0%} of recent ranges agree with the pose, "
             f"{self._short_share:.0%} are too short for it"
         )
+        brief = f"{self._accepted_share:.0%} of ranges agree"
+        if self._short_share > self._table.max_short_share:
+            brief = f"{self._short_share:.0%} ranges too short"
+        elif self._has_agreed:
+            brief = self._uwb_brief(now_ns, brief)
         if self._has_agreed:
-            return Health(State.LOST, shares)
-        on_mark = "" if self._resets else "; is the robot on its start mark?"
-        return Health(State.STARTING, shares + on_mark)
+            return Health(State.LOST, shares, brief)
+        if self._resets:
+            return Health(State.STARTING, shares, brief)
+        return Health(State.STARTING, f"{shares}; is the robot on its start mark?", f"on the mark? {brief}")
 
     def _sources(self, now_ns: int) -> list[_Source]:
         def source(what: str, seen_ns: int | None, limit: float) -> _Source:

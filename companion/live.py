@@ -172,7 +172,8 @@ class LiveRun:
             if event.name in self._chain.sensors:
                 self._set_open(event)
             return
-        chunk = RawChunk(event.name, Direction.IN, event.stamp_ns, event.data)
+        stamp_ns = self._chain.stamp_to_log(event.stamp_ns)
+        chunk = RawChunk(event.name, Direction.IN, stamp_ns, event.data)
         self._log.raw(chunk)
         if event.name in self._links:
             self._show(chunk)
@@ -277,6 +278,8 @@ class LiveRun:
                 self._say(line)
 
     def _close(self) -> None:
+        # So far a replay gives ticks, though nothing arrived after the last of them.
+        self._log.raw(RawChunk(MAVLINK, Direction.IN, self._chain.stamp_to_log(0), b""))
         for name, sensor in self._chain.sensors.items():
             for data in sensor.closing():
                 self._send(name, data)

@@ -10,9 +10,9 @@ from companion.config import Config
 from companion.errors import UserError
 from companion.evaluate import Reference, compare
 from companion.log import Log, RawChunk, Truth
-from companion.pipeline import Chain, Pipeline, make_front_end, make_monitor, make_sensors
+from companion.pipeline import Chain, make_monitor, make_sensors
 from companion.replay import config_of
-from companion.trial import TrialFigures, make_choice, trial_figures
+from companion.trial import TrialFigures, make_choice, trial_figures, watched_pipeline
 from companion.watched import WatchedEstimator
 from estimators.messages import PoseEstimate
 
@@ -86,7 +86,7 @@ def run_records(
         )
         for choice in choices
     }
-    chain = Chain(config, start_ns, Pipeline(make_front_end(config), watched), next(iter(watched)))
+    chain = Chain(config, start_ns, watched_pipeline(config, watched), next(iter(watched)))
     poses: dict[str, list[PoseEstimate]] = {choice: [] for choice in choices}
     instants: list[int] = []
     for record in waiting:

@@ -8,13 +8,13 @@ import numpy as np
 from companion.config import Config
 from companion.errors import UserError
 from companion.log import Log, RawChunk
-from companion.pipeline import Chain, Pipeline
+from companion.pipeline import Chain, Pipeline, make_scan_odometry
 from estimators import make_estimator
 from estimators.base import Estimator, Report, Verdict
 from estimators.geometry import compose, inverse, transform
 from estimators.lidar.floor_map import FloorMap, floor_map_of
+from estimators.lidar.front_ends import ScanFrontEnd
 from estimators.lidar.occupancy_grid import OccupancyGrid
-from estimators.lidar.scan_matching import ScanMatcher
 from estimators.messages import FloatArray, Measurement, PoseEstimate, PoseIncrement
 
 MOST_SIGMA = 0.1
@@ -33,9 +33,9 @@ class Survey:
 class _Surveyor:
     """An estimator that draws every matched scan into a grid."""
 
-    def __init__(self, estimator: Estimator, matcher: ScanMatcher, T_body_lidar: FloatArray) -> None:
+    def __init__(self, estimator: Estimator, front_end: ScanFrontEnd, T_body_lidar: FloatArray) -> None:
         self._estimator = estimator
-        self._matcher = matcher
+        self._front_end = front_end
         self._T_body_lidar = T_body_lidar
         self.grid = OccupancyGrid(OccupancyGrid.Config())
         self.inserted = self.scans = 0
@@ -59,7 +59,7 @@ class _Surveyor:
         if max(pose.planar_cov[0, 0], pose.planar_cov[1, 1]) > MOST_SIGMA**2:
             return
         T_map_lidar = compose(np.array([*pose.xy, pose.yaw]), self._T_body_lidar)
-        in_lidar = transform(inverse(self._T_body_lidar), self._matcher.points)
+        in_lidar = transform(inverse(self._T_body_lidar), self._front_end.points)
         self.inserted += self.grid.insert(T_map_lidar, in_lidar)
 
 
@@ -76,10 +76,10 @@ def survey(log: Log, config: Config, estimator: str, on_progress: Callable[[floa
         UserError: no scan could be placed.
     """
     mounting = config.lidar_mounting()
-    matcher = ScanMatcher(config.scan_matcher, mounting, config.scan_preparation)
+    front_end = make_scan_odometry(config)
     inner = make_estimator(estimator, config.estimator_config(estimator), config.setup())
-    surveyor = _Surveyor(inner, matcher, mounting)
-    chain = Chain(config, log.start_ns, Pipeline(matcher, {estimator: surveyor}), estimator)
+    surveyor = _Surveyor(inner, front_end, mounting)
+    chain = Chain(config, log.start_ns, Pipeline(front_end, {estimator: surveyor}), estimator)
     for record in log:
         if isinstance(record, RawChunk):
             for _ in chain.feed(record):

@@ -1,8 +1,8 @@
 """The table `[mavlink]` of a site file: links, ids, and what is said to the autopilot."""
 
-from typing import Literal
+from typing import Annotated, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from drivers.autopilot import Autopilot
 
@@ -40,7 +40,9 @@ class MavlinkTable(BaseModel):
         "",
         description="a ground station's own link: it gets no poses; empty = it is reached by the autopilot",
     )
-    ground_ids: tuple[int, ...] = Field((255,), description="system ids of ground stations that are obeyed")
+    ground_ids: tuple[Annotated[int, Field(ge=1, le=255)], ...] = Field(
+        (255,), description="system ids of ground stations that are obeyed"
+    )
     forward: bool = Field(False, description="pass messages on between autopilot and ground station")
     system_id: int = Field(
         1, ge=1, le=255, description="system id until the autopilot's own HEARTBEAT is heard"
@@ -83,3 +85,17 @@ class MavlinkTable(BaseModel):
     )
     gate: GateTable = Field(default_factory=GateTable)
     inputs: Autopilot.Config = Field(default_factory=Autopilot.Config)
+
+    @model_validator(mode="after")
+    def _makes_sense(self) -> Self:
+        if self.speed and self.message == "odometry":
+            raise ValueError("odometry carries the velocity already, set speed = false")
+        if self.speed and self.profile == "px4":
+            raise ValueError('PX4 reads no VISION_SPEED_ESTIMATE, set speed = false or message = "odometry"')
+        if self.forward and not self.ground_url:
+            raise ValueError("forward needs a second link to pass messages on to, set ground_url")
+        if self.ground_url and self.ground_url == self.url:
+            raise ValueError(f"url and ground_url are the same link, {self.url!r}")
+        if self.autopilot_id in self.ground_ids:
+            raise ValueError(f"autopilot_id {self.autopilot_id} is one of ground_ids, too")
+        return self

@@ -4,15 +4,16 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from companion.autopilot_client import AutopilotClient, Comparison, compare_parameters
-from companion.mavlink.parameter_files import Setting, read_settings, settings_file, write_settings
+from companion.terminal import message_console, result_console
+
+if TYPE_CHECKING:
+    from companion.autopilot_client import AutopilotClient, Comparison
 
 EXIT_DIFFERENT = 1
 
@@ -21,8 +22,7 @@ app = typer.Typer(
     no_args_is_help=True,
     rich_markup_mode="rich",
 )
-out = Console(highlight=False)
-err = Console(stderr=True, highlight=False)
+out, err = result_console(), message_console()
 
 File = Annotated[
     str,
@@ -69,6 +69,8 @@ def apply(
 
     Exit codes: 0 all agree now, 1 something was refused or you said no, 2 the call is wrong.
     """
+    from companion.mavlink.parameter_files import Setting, write_settings
+
     with _comparisons(file, url, baud) as (client, comparisons):
         _show(comparisons)
         changes = [c for c in comparisons if c.name and not c.agrees]
@@ -92,7 +94,10 @@ def apply(
 
 
 @contextmanager
-def _comparisons(file: str, url: str, baud: int) -> Iterator[tuple[AutopilotClient, list[Comparison]]]:
+def _comparisons(file: str, url: str, baud: int) -> Iterator[tuple["AutopilotClient", list["Comparison"]]]:
+    from companion.autopilot_client import AutopilotClient, compare_parameters
+    from companion.mavlink.parameter_files import read_settings, settings_file
+
     if Path(file).is_file():
         read_settings(Path(file))  # what is wrong with it is said before anyone is waited for
     err.print(f"[dim]waiting for the autopilot on {url}[/]")
@@ -105,7 +110,7 @@ def _comparisons(file: str, url: str, baud: int) -> Iterator[tuple[AutopilotClie
         client.close()
 
 
-def _show(comparisons: list[Comparison]) -> None:
+def _show(comparisons: list["Comparison"]) -> None:
     different = [c for c in comparisons if not c.agrees]
     if different:
         table = Table()

@@ -5,7 +5,7 @@ says what time it is. Poses are given at fixed instants (ticks) counted from the
 replay of the log asks for exactly the poses that the live run gave.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
@@ -13,6 +13,7 @@ from typing import Protocol
 from companion.config import Config, HealthTable
 from companion.health import AnchorState, Health, HealthMonitor
 from companion.log import Direction, RawChunk
+from companion.look_back import LookBack, make_look_back
 from companion.mavlink.link import NAME as MAVLINK
 from companion.mavlink.signing import read_key
 from companion.sequencer import Sequencer
@@ -21,8 +22,10 @@ from drivers.autopilot import Autopilot
 from drivers.framing import Sensor
 from estimators import make_estimator
 from estimators.base import Estimator, Report, Sketch, Sketched
+from estimators.lidar.front_ends import ScanFrontEnd, make_scan_front_end
+from estimators.lidar.fused_odometry import FusedOdometry
 from estimators.lidar.scan_matching import ScanMatcher
-from estimators.messages import Measurement, PoseEstimate, PoseIncrement, RangeFrame, Scan
+from estimators.messages import LoopClosure, Measurement, PoseEstimate, PoseIncrement, RangeFrame, Scan
 from estimators.models.range_bias import without_bias
 
 
@@ -74,20 +77,37 @@ class Pipeline:
 
     Args:
         front_end: gives the increments.
-        estimators: name -> estimator.
+        estimators: name -> estimator; the first one's poses say where to look for loop closures.
+        look_back: finds them; None where nobody has a use for them.
     """
 
-    def __init__(self, front_end: FrontEnd, estimators: Mapping[str, Estimator]) -> None:
+    def __init__(
+        self,
+        front_end: FrontEnd,
+        estimators: Mapping[str, Estimator],
+        look_back: LookBack | None = None,
+    ) -> None:
         self._front_end = front_end
         self._estimators = dict(estimators)
+        self._look_back = look_back
 
     def step(self, measurement: Measurement) -> list[Outcome]:
-        """Process one measurement; a scan also yields the outcome of its increment."""
-        outcomes = [self._update(measurement)]
+        """Process one measurement; a scan also yields the outcomes of its increment and of a loop closure."""
+        # Odometry from outside reaches the estimators by the front end alone, so that it counts once.
+        outcomes = [] if isinstance(measurement, PoseIncrement) else [self._update(measurement)]
         increment = self._front_end.update(measurement)
         if increment is not None:
             outcomes.append(self._update(increment))
+            closure = self._closure(increment)
+            if closure is not None:
+                outcomes.append(self._update(closure))
         return outcomes
+
+    def _closure(self, increment: PoseIncrement) -> LoopClosure | None:
+        if self._look_back is None:
+            return None
+        guide = next(iter(self._estimators.values()))
+        return self._look_back.update(increment, guide.pose_at(increment.stamp_ns))
 
     def poses_at(self, stamp_ns: int) -> dict[str, PoseEstimate | None]:
         """Each estimator's pose."""
@@ -139,11 +159,25 @@ class Chain:
         """What became lately of each anchor's ranges, by the primary estimator."""
         return self._monitor.anchors(now_ns)
 
+    def stamp_to_log(self, arrival_ns: int) -> int:
+        """Stamp of bytes that are only taken now: not before the last tick, which was given without them.
+
+        On a busy machine bytes may wait for longer than `pipeline.hold_ms`. A replay of the log must not have
+        them any earlier.
+        """
+        return max(arrival_ns, self._start_ns + round((self._ticks - 1) * self._period_ns))
+
     def feed(self, chunk: RawChunk) -> Iterator[Tick]:
-        """Give the ticks that were due before these bytes arrived, then decode the bytes."""
+        """Give the ticks that were due before these bytes arrived, then decode the bytes.
+
+        What went out says nothing: a loop that is behind writes for one tick when the next are due, too, and
+        takes what has arrived before it gives them.
+        """
+        if chunk.direction is Direction.OUT:
+            return
         yield from self.advance(chunk.stamp_ns)
         decoder = self._decoders.get(chunk.source)
-        if decoder is not None and chunk.direction is Direction.IN:
+        if decoder is not None:
             for measurement in decoder.feed(chunk.data, chunk.stamp_ns):
                 # Here once, so that logs stay as measured and replay takes off what it is told to.
                 if isinstance(measurement, RangeFrame):
@@ -197,17 +231,47 @@ def make_monitor(config: Config, sensors: Mapping[str, Sensor]) -> HealthMonitor
     )
 
 
-def make_parts(config: Config, names: list[str]) -> tuple[FrontEnd, dict[str, Estimator]]:
-    """Front end and the named estimators with the site's settings."""
+def make_parts(
+    config: Config, names: list[str], close_loops: bool = False
+) -> tuple[FrontEnd, dict[str, Estimator], LookBack | None]:
+    """Front end and the named estimators with the site's settings, and what finds loop closures.
+
+    Args:
+        config: of the site.
+        names: of the estimators.
+        close_loops: look for closures although none of the estimators has a use for them.
+    """
     setup = config.setup()
-    return make_front_end(config), {
+    estimators = {
         name: make_estimator(name, config.estimator_config(name), setup, config.relocation) for name in names
     }
+    front_end, look_back = make_front_end(config, names, close_loops)
+    return front_end, estimators, look_back
 
 
-def make_front_end(config: Config) -> FrontEnd:
+def make_front_end(
+    config: Config, names: Iterable[str], close_loops: bool = False
+) -> tuple[FrontEnd, LookBack | None]:
+    """What turns scans, and odometry from outside, into increments; and what finds loop closures.
+
+    Args:
+        config: of the site.
+        names: of the estimators.
+        close_loops: look for closures although none of the estimators has a use for them.
+    """
+    inputs = config.mavlink.inputs
+    scans = make_scan_odometry(config)
+    # EKF-SLAM holds scans against its own map and has no keyframes to look back from.
+    if not isinstance(scans, ScanMatcher):
+        return scans, None
+    look_back = make_look_back(config, scans, names, close_loops)
+    return FusedOdometry(scans) if inputs.odometry or inputs.wheels else scans, look_back
+
+
+def make_scan_odometry(config: Config) -> ScanFrontEnd:
     """What turns the site's scans into increments."""
-    return ScanMatcher(config.scan_matcher, config.lidar_mounting(), config.scan_preparation)
+    name, mounting = config.pipeline.front_end, config.lidar_mounting()
+    return make_scan_front_end(name, config.front_end_config(), mounting, config.scan_preparation)
 
 
 def make_pipeline(config: Config, names: list[str]) -> Pipeline:

@@ -8,11 +8,11 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from scipy.stats import chi2
 
 from companion.errors import UserError
 from companion.evaluate import Errors
 from companion.replay import Replay
+from estimators import chi2
 from estimators.messages import FloatArray
 
 # Okabe and Ito's colours: told apart by colour-blind eyes too.

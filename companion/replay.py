@@ -88,7 +88,7 @@ class Replay:
         names: estimators, the primary first.
         poses: estimator -> its poses, one per tick at which it had one.
         errors: estimator -> errors against the log's truth; empty without truth.
-        update_times: estimator (and `scan_matcher`) -> time of its updates.
+        update_times: estimator (and `front_end`) -> time of its updates.
         verdicts: estimator -> how often each verdict was given to a range or increment.
         anchor_verdicts: estimator -> anchor -> the same of its ranges.
         range_lines: lines of `ranges.csv`, of the primary.
@@ -138,6 +138,7 @@ def replay(
     on_progress: Callable[[float], None] | None = None,
     on_chunk: Callable[[RawChunk], None] | None = None,
     until_ns: int | None = None,
+    close_loops: bool = False,
 ) -> Replay:
     """Run a log through the pipeline.
 
@@ -149,17 +150,18 @@ def replay(
         on_progress: called now and then with the share of the log that is done.
         on_chunk: called for every chunk before it is decoded; ticks then hold the estimators' sketches.
         until_ns: end there.
+        close_loops: look for loop closures although none of the estimators has a use for them.
 
     Raises:
         UserError: the log holds no bytes of any sensor of the site.
     """
     begin_ns = last_ns = log.start_ns
     result = Replay(config, names, {name: [] for name in names})
-    result.update_times = {name: Stopwatch() for name in ["scan_matcher", *names]}
+    result.update_times = {name: Stopwatch() for name in ["front_end", *names]}
     result.verdicts = {name: Counter() for name in names}
     result.anchor_verdicts = {name: defaultdict(Counter) for name in names}
     result.iterations = {name: [] for name in names}
-    pipeline = _timed_pipeline(config, names, result.update_times)
+    pipeline = _timed_pipeline(config, names, result.update_times, close_loops)
     chain = Chain(config, begin_ns, pipeline, names[0], watched=on_chunk is not None)
     truths: list[Truth] = []
     ticks_ns: list[int] = []
@@ -262,16 +264,19 @@ def summary(result: Replay) -> dict[str, object]:
         "complete": result.complete,
         "primary": result.names[0],
         "estimators": estimators,
-        "scan_matcher_ms": result.update_times["scan_matcher"].mean_ms,
+        "front_end_ms": result.update_times["front_end"].mean_ms,
         "health_ticks": dict(result.health),
         "late_measurements": result.late,
         "sensors": {name: asdict(stats) for name, stats in result.sensors.items()},
     }
 
 
-def _timed_pipeline(config: Config, names: list[str], update_times: dict[str, Stopwatch]) -> Pipeline:
-    front_end, estimators = make_parts(config, names)
+def _timed_pipeline(
+    config: Config, names: list[str], update_times: dict[str, Stopwatch], close_loops: bool
+) -> Pipeline:
+    front_end, estimators, look_back = make_parts(config, names, close_loops)
     return Pipeline(
-        _TimedFrontEnd(front_end, update_times["scan_matcher"]),
+        _TimedFrontEnd(front_end, update_times["front_end"]),
         {name: _TimedEstimator(estimator, update_times[name]) for name, estimator in estimators.items()},
+        look_back,
     )

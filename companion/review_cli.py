@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 from companion.config import Config, load_config
 from companion.errors import UserError
+from companion.terminal import message_console, progress, result_console
 
 if TYPE_CHECKING:
     import rerun as rr
@@ -68,7 +68,7 @@ def review(
     from companion.replay import config_of
     from estimators import ESTIMATORS
 
-    out, err = Console(emoji=False), Console(stderr=True, highlight=False, emoji=False)
+    out, err = result_console(), message_console()
     if len(logs) > LOGS:
         raise UserError(f"{len(logs)} logs given, at most {LOGS} can be compared")
     if save is not None and web:
@@ -89,19 +89,11 @@ def review(
 
     stream, viewer = _stream(opened[0][1], save, web, err)
     begun = time.perf_counter()
-    with Progress(
-        TextColumn("{task.description:>9}"),
-        BarColumn(),
-        TaskProgressColumn(),
-        TimeRemainingColumn(),
-        console=err,
-        transient=True,
-        disable=not err.is_terminal,
-    ) as progress:
-        bar = progress.add_task("review", total=1.0)
+    with progress(err) as shown:
+        bar = shown.add_task("review", total=1.0)
         try:
             reviews = review_logs(
-                opened, names, Span(begin, end), stream, lambda share: progress.update(bar, completed=share)
+                opened, names, Span(begin, end), stream, lambda share: shown.update(bar, completed=share)
             )
             stream.flush()
         except RuntimeError as error:
@@ -112,7 +104,7 @@ def review(
         _print(found, took, out)
     if save is not None:
         stream.disconnect()
-        out.print(f"  written to {save}; open it with: rerun {save}", highlight=False, soft_wrap=True)
+        out.print(f"  written to {save}; open it with: rerun {save}", soft_wrap=True)
     elif viewer is not None and viewer.is_page:
         err.print("served until Ctrl-C")
         viewer.serve_until_interrupted()

@@ -7,12 +7,10 @@ from datetime import datetime
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 import typer
-from rich.console import Console
 from rich.markup import escape
 
-from companion.config import params_dir
+from companion.terminal import message_console, result_console
 
 EXIT_NOT_FOLLOWED = 1
 
@@ -46,16 +44,19 @@ def sitl(
 
     Exit codes: 0 it followed, 1 it had no position of its own, 2 the call is wrong or there is no SITL.
     """
+    import numpy as np
+
+    from companion.config import named_file
     from companion.sim.scenario import load_scenario
     from companion.sitl import SitlRun
 
-    out, err = Console(highlight=False, soft_wrap=True), Console(stderr=True, highlight=False)
-    path = Path(world) if Path(world).is_file() else params_dir() / "scenarios" / f"{world}.toml"
+    out, err = result_console(), message_console()
+    path = named_file(Path(world), "scenarios")
     folder = folder or Path("out") / datetime.now().astimezone().strftime("sitl-%Y%m%d-%H%M%S")
     begin = time.monotonic()
 
     def say(line: str) -> None:
-        err.print(f"[dim]{time.monotonic() - begin:8.1f}[/]  {escape(line)}", soft_wrap=True)
+        err.print(f"[dim]{time.monotonic() - begin:8.1f}[/]  {escape(line)}")
 
     say(f"waiting for the autopilot on {connect}")
     run = SitlRun(load_scenario(path, seed, sets or []), connect, folder, say)

@@ -75,7 +75,7 @@ def smooth_log(
 
     primary = config.pipeline.estimator
     names = list(dict.fromkeys([primary, "lidar_odometry"])) if find_anchors else [primary]
-    result = replay(log, config, names, collect, replayed)
+    result = replay(log, config, names, collect, replayed, close_loops=True)
     begin = time.perf_counter()
     settings = config.estimator_config("graph")
     assert isinstance(settings, GraphSmoother.Config)

@@ -4,15 +4,11 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
 import typer
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from companion.config import load_config
 from companion.errors import UserError
-from companion.log import Log
+from companion.terminal import Sets, message_console, progress, result_console
 
 if TYPE_CHECKING:
     from companion.smooth import SmoothedLog
@@ -31,16 +27,15 @@ def smooth(
     folder: Annotated[
         Path | None, typer.Option("--out", metavar="DIR", help="Folder to write; default out/LOGNAME-smooth.")
     ] = None,
-    sets: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="Change one setting of the site. Repeatable."),
-    ] = None,
+    sets: Sets = None,
 ) -> None:
     """Find the course that fits a whole log best: every pose from what came before it and after.
 
     Writes poses.tum, summary.json and smooth.png; with --anchors or --biases a survey of the anchors from the
     drive, and anchors.toml to paste into the site file. Afterwards only: a live pose knows no future.
     """
+    from companion.config import load_config
+    from companion.log import Log
     from companion.plots import figure
     from companion.replay import config_of, tum_line
 
@@ -48,23 +43,13 @@ def smooth(
     from companion.smooth import SMOOTHED, anchors_toml, smooth_log
     from companion.tables import accuracy_table
 
-    out, err = Console(), Console(stderr=True, highlight=False)
+    out, err = result_console(), message_console()
     opened = Log(log)
     config = load_config(site, sets or []) if site else config_of(opened, sets or [])
     folder = folder or Path("out") / f"{log.stem}-smooth"
-    with Progress(
-        TextColumn("{task.description:>9}"),
-        BarColumn(),
-        TaskProgressColumn(),
-        TimeRemainingColumn(),
-        console=err,
-        transient=True,
-        disable=not err.is_terminal,
-    ) as progress:
-        bar = progress.add_task(log.name, total=1.0)
-        found = smooth_log(
-            opened, config, anchors, biases, lambda share: progress.update(bar, completed=share)
-        )
+    with progress(err) as shown:
+        bar = shown.add_task(log.name, total=1.0)
+        found = smooth_log(opened, config, anchors, biases, lambda share: shown.update(bar, completed=share))
     files = {
         "poses.tum": "".join(tum_line(pose) for pose in found.replay.poses[SMOOTHED]),
         "summary.json": json.dumps(_summary(found), indent=2) + "\n",
@@ -82,13 +67,21 @@ def smooth(
     out.print(accuracy_table(found.replay, f"{found.replay.duration:.1f} s{errors}"))
     out.print(_anchor_table(found, anchors, biases))
     out.print(f"  frame: {found.gauge}", highlight=False, soft_wrap=True)
+    out.print(f"  loop closures: {_closures(found)}", highlight=False, soft_wrap=True)
     if anchors:
         out.print()
         out.print(anchors_toml(found), highlight=False, markup=False)
     out.print(f"  written to {folder}: {', '.join([*files, 'smooth.png'])}", highlight=False, soft_wrap=True)
 
 
+def _closures(found: "SmoothedLog") -> str:
+    smoothed = found.smoothed
+    return f"{smoothed.closures} used, {smoothed.false_closures} refused because they contradict the rest"
+
+
 def _anchor_table(found: "SmoothedLog", anchors: bool, biases: bool) -> Table:
+    import numpy as np
+
     table = Table(title="anchors, and what is left of their ranges", title_justify="left")
     headings = ["anchor"]
     headings += ["x\nm", "y\nm", "sigma\nm", "moved\nm"] if anchors else []
@@ -115,6 +108,7 @@ def _summary(found: "SmoothedLog") -> dict[str, object]:
         "rmse_m": {name: accuracy.rmse for name, accuracy in accuracies.items() if accuracy is not None},
         "gauge": found.gauge,
         "solver_steps": found.smoothed.iterations,
+        "loop_closures": {"used": found.smoothed.closures, "refused": found.smoothed.false_closures},
         "anchors": {
             str(anchor_id): {
                 "position": fix.position.tolist(),

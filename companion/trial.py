@@ -13,7 +13,14 @@ from companion.evaluate import Errors, Reference, compare
 from companion.legs import LegFigures, leg_figures
 from companion.log import Truth
 from companion.metrics import integrity_violations, relative_errors, trajectory_error
-from companion.pipeline import Chain, Outcome, Pipeline, make_front_end, make_monitor, make_sensors
+from companion.pipeline import (
+    Chain,
+    Outcome,
+    Pipeline,
+    make_front_end,
+    make_monitor,
+    make_sensors,
+)
 from companion.range_score import RangeScore, TrueExcess
 from companion.sim.measurements import MeasuredWalk, measure, setup_of
 from companion.sim.scenario import Scenario, load_scenario
@@ -186,6 +193,13 @@ def make_choice(config: Config, setup: Setup, choice: str, start: FloatArray) ->
     return make_estimator(split_choice(choice)[0], settings, setup, config.relocation)
 
 
+def watched_pipeline(config: Config, choices: Mapping[str, Estimator]) -> Pipeline:
+    """Pipeline of the site's front end and these estimators, by choice."""
+    names = (split_choice(choice)[0] for choice in choices if choice not in (LIDAR_ALONE, UWB_ALONE))
+    front_end, look_back = make_front_end(config, names)
+    return Pipeline(front_end, choices, look_back)
+
+
 def _step_through(
     walk: MeasuredWalk, estimators: Mapping[str, Estimator], poses: Mapping[str, list[PoseEstimate]]
 ) -> tuple[list[Truth], list[int], list[Outcome]]:
@@ -212,7 +226,8 @@ def _run_chain(
 ) -> tuple[list[Truth], list[int], list[Outcome]]:
     """The whole chain from emulated bytes on, in memory; poses at its ticks."""
     config = scenario.config
-    chain = Chain(config, START_NS, Pipeline(make_front_end(config), estimators), next(iter(estimators)))
+    pipeline = watched_pipeline(config, estimators)
+    chain = Chain(config, START_NS, pipeline, next(iter(estimators)))
     truths: list[Truth] = []
     instants: list[int] = []
     outcomes: list[Outcome] = []

@@ -22,17 +22,17 @@ class _LeastDelay:
 
     def __init__(self) -> None:
         self._blocks: deque[tuple[int, int]] = deque(maxlen=BLOCKS)
+        self.value_ns: int | None = None
 
     def add(self, at_ns: int, delay_ns: int) -> None:
         block = at_ns // BLOCK_NS
-        if self._blocks and self._blocks[-1][0] == block:
-            self._blocks[-1] = (block, min(self._blocks[-1][1], delay_ns))
-        else:
+        if not self._blocks or self._blocks[-1][0] != block:
             self._blocks.append((block, delay_ns))
-
-    @property
-    def value_ns(self) -> int | None:
-        return min((delay_ns for _, delay_ns in self._blocks), default=None)
+        elif delay_ns < self._blocks[-1][1]:
+            self._blocks[-1] = (block, delay_ns)
+        else:
+            return
+        self.value_ns = min(least_ns for _, least_ns in self._blocks)
 
 
 class AutopilotClock:

@@ -40,6 +40,11 @@ def estimator_config_class(name: str) -> type[BaseModel]:
     return cast("type[BaseModel]", _estimator_class(name).Config)
 
 
+def uses_closures(name: str) -> bool:
+    """Whether the named estimator takes loop closures: it has a setting `places` then."""
+    return "places" in estimator_config_class(name).model_fields
+
+
 def make_estimator(
     name: str, config: BaseModel, setup: Setup, relocation: BaseModel | None = None
 ) -> Estimator:

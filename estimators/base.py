@@ -68,7 +68,8 @@ class Report:
         verdicts: one per range of a RangeFrame, else one.
         residuals: like `verdicts`; measured minus predicted [m] for ranges, NaN where there is none.
         nis: like `verdicts`; normalised innovation squared, NaN where there is none.
-        note: what the estimator lacks for a pose, for the operator; empty when it has one.
+        note: what the estimator lacks for a pose, for operator and pilot: at most 35 characters, the room
+            in a text to the pilot; empty when it has one.
         iterations: steps of an iterative solver; None where none was at work.
     """
 

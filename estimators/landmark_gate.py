@@ -4,8 +4,8 @@ from math import isfinite
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
-from scipy.stats import chi2
 
+from estimators import chi2
 from estimators.base import Setup, Verdict
 from estimators.messages import FloatArray, LandmarkFrame
 

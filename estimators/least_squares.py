@@ -4,8 +4,8 @@ from collections.abc import Sequence
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
-from scipy.stats import chi2
 
+from estimators import chi2
 from estimators.base import Report, Setup, Verdict
 from estimators.geometry import lift
 from estimators.messages import FloatArray, Measurement, PoseEstimate, RangeFrame

@@ -129,6 +129,24 @@ class PoseIncrement:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class LoopClosure:
+    """Planar motion of the body between two instants long apart: it came back to a place that it knows.
+
+    Attributes:
+        from_stamp_ns: time of the older pose; equal to ``stamp_ns`` when the instant founds a place at which
+            later closures may begin.
+        stamp_ns: time of the newer pose.
+        increment: (3,) float64, as in PoseIncrement.
+        cov: (3, 3) float64, covariance of ``increment``.
+    """
+
+    from_stamp_ns: int
+    stamp_ns: int
+    increment: FloatArray
+    cov: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class LandmarkFrame:
     """Known landmarks as one look of a LiDAR or camera finds them, each already told from the others.
 
@@ -190,7 +208,9 @@ class PoseEstimate:
         return self.cov[PLANAR]
 
 
-Measurement: TypeAlias = RangeFrame | Scan | ImuSample | Attitude | Height | PoseIncrement | LandmarkFrame
+Measurement: TypeAlias = (
+    RangeFrame | Scan | ImuSample | Attitude | Height | PoseIncrement | LoopClosure | LandmarkFrame
+)
 
 
 def measurement_stamp_ns(measurement: Measurement) -> int:

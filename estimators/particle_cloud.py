@@ -15,7 +15,6 @@ import numpy as np
 from pydantic import Field
 
 from estimators.base import Report, Setup, Sketch, Verdict
-from estimators.geometry import lift
 from estimators.landmark_gate import LandmarkGate
 from estimators.lidar.keyframes import START_SPEED_SIGMA, KeyframeTracker
 from estimators.messages import (
@@ -121,9 +120,9 @@ class ParticleCloud(KeyframeTracker):
         mean, cov = self._cloud.moments(self._particles, self._weights, 6)
         dt = 0.0 if self._stands else (stamp_ns - self._stamp_ns) * 1e-9
         F, Q = constant_velocity(dt, *self._accel_noise)
-        planar = (F @ cov @ F.T + Q)[POSE, POSE]
-        cov = self._setup.lift_covariance(0.5 * (planar + planar.T) + self._cloud.LEAST_VARIANCE * np.eye(3))
-        return PoseEstimate(stamp_ns, lift((F @ mean)[POSE], self._setup.height), cov, self._reset_counter)
+        cov = F @ cov @ F.T + Q
+        cov = 0.5 * (cov + cov.T) + self._cloud.LEAST_VARIANCE * np.eye(6)
+        return self._estimate(stamp_ns, F @ mean, cov)
 
     @abstractmethod
     def _take(self, misfits: FloatArray, measured: Likelihood) -> None:

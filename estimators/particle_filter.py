@@ -5,8 +5,8 @@ from typing import Literal
 
 import numpy as np
 from pydantic import Field
-from scipy.stats import chi2
 
+from estimators import chi2
 from estimators.base import Report, Setup, Verdict
 from estimators.geometry import wrap_angles
 from estimators.lidar.likelihood_field import LikelihoodField, beams_of

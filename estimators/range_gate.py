@@ -6,8 +6,8 @@ from math import sqrt
 from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
-from scipy.stats import chi2
 
+from estimators import chi2
 from estimators.base import Setup, Verdict
 from estimators.messages import FloatArray, Measurement, PoseEstimate, RangeFrame
 from estimators.models.range import reduce_height
@@ -59,16 +59,16 @@ class HorizontalRanges:
 
     def __init__(self, sigma: float, setup: Setup) -> None:
         self._sigma = sigma
-        self._setup = setup
+        self._anchors = {i: (anchor, setup.height_to(anchor)) for i, anchor in setup.anchors.items()}
 
     def of(self, frame: RangeFrame) -> Iterator[Verdict | tuple[FloatArray, float, float]]:
         """For each range of a frame the anchor (3,), horizontal range and its sigma [m], or what is wrong."""
         for anchor_id, slant in zip(frame.anchor_ids.tolist(), frame.ranges.tolist(), strict=True):
-            anchor = self._setup.anchors.get(anchor_id)
-            if anchor is None:
+            if anchor_id not in self._anchors:
                 yield Verdict.UNKNOWN_ANCHOR
                 continue
-            reduced = reduce_height(slant, self._sigma, self._setup.height_to(anchor))
+            anchor, height = self._anchors[anchor_id]
+            reduced = reduce_height(slant, self._sigma, height)
             yield Verdict.IMPOSSIBLE if reduced is None else (anchor, *reduced)
 
 
@@ -117,7 +117,7 @@ class RangeGate:
     def __init__(self, config: Config, setup: Setup) -> None:
         self._horizontal = HorizontalRanges(config.range_sigma, setup)
         self._excess = config.nlos_excess
-        self._limit = float(chi2.ppf(config.range_gate, 1))
+        self._limit = chi2.ppf(config.range_gate, 1)
         methods = config.nlos
         self._looks_at_residual = "prediction" in methods or "robust" in methods
         self._weighs = "robust" in methods

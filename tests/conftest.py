@@ -1,10 +1,15 @@
 """Fixtures shared by all tests."""
 
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeAlias
 
 import pytest
 from hypothesis import HealthCheck, settings
 
+from companion.cli import main
 from companion.config import Config, load_config, params_dir
 from companion.sim.scenario import Scenario, load_scenario
 from companion.sim.simulate import simulate
@@ -35,6 +40,34 @@ def write_log(scenario: Scenario, path: Path) -> Path:
     for _ in simulate(scenario, path):
         pass
     return path
+
+
+@dataclass(frozen=True, slots=True)
+class Called:
+    """What a command left, as `subprocess` tells it."""
+
+    returncode: object
+    stdout: str
+    stderr: str
+
+
+Command: TypeAlias = Callable[..., Called]
+
+
+@pytest.fixture
+def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> Command:
+    """The program, called with arguments in this process: to start another one takes seconds."""
+
+    def call(*arguments: str | Path) -> Called:
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setattr(sys, "argv", ["companion", *map(str, arguments)])
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as ended:
+            main()
+        said = capsys.readouterr()
+        return Called(ended.value.code, said.out, said.err)
+
+    return call
 
 
 @pytest.fixture

@@ -191,7 +191,7 @@ class _Drive:
                     float(np.sqrt(cov[first + i, first + i])),
                     0.0,
                     float(errors[own & self._used].std()),
-                    int(self._used[own].sum()),
+                    self._used[own],
                     Ranges(times[own], sights.measured[own], distances[own]),
                 )
         rows = [first + i for i, anchor_id in enumerate(self._anchor_ids) if anchor_id in fits]

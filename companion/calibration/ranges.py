@@ -1,9 +1,10 @@
-"""Range biases against known positions: a line over the distance for each anchor, with its uncertainty."""
+"""Range biases against known positions: a constant for each anchor, one growth with the distance for all."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from estimators.messages import FloatArray, RangeFrame
 from estimators.models.range_bias import RangeBias
@@ -15,7 +16,7 @@ MIN_SPREAD = 0.5
 MIN_RANGES = 20
 """Fewer ranges than this are no calibration of an anchor."""
 _TRIM = _SIGNIFICANT = 3.0
-_ROUNDS = 20
+_ROUNDS, _GROWTH_ROUNDS = 20, 3
 _BLOCK = 1.0
 """Errors within a time like this [s] are alike; those further apart are taken for independent."""
 
@@ -42,9 +43,9 @@ class AnchorFit:
     Attributes:
         bias: of the line.
         constant_sigma: standard deviation of `bias.constant` [m].
-        per_metre_sigma: standard deviation of `bias.per_metre`; 0 when it was not looked for.
+        per_metre_sigma: standard deviation of `bias.per_metre`; 0 when there is none.
         spread: standard deviation of the errors about the line, of the ranges used [m].
-        used: ranges that the line was laid through.
+        kept: (N,) True for the ranges that were used.
         ranges: of the anchor, all of them.
     """
 
@@ -52,8 +53,13 @@ class AnchorFit:
     constant_sigma: float
     per_metre_sigma: float
     spread: float
-    used: int
+    kept: NDArray[np.bool_]
     ranges: Ranges
+
+    @property
+    def used(self) -> int:
+        """Number of the ranges that were used."""
+        return int(self.kept.sum())
 
     def residuals(self, calibrated: bool) -> FloatArray:
         """Measured or corrected range minus distance, (N,) [m]."""
@@ -107,7 +113,11 @@ def ranges_by_anchor(
 
 
 def fit_biases(by_anchor: Mapping[int, Ranges]) -> Calibration:
-    """Biases of anchors, each from its own ranges.
+    """Biases of anchors: a constant of each, and one growth with the distance for all.
+
+    Growth comes from the receive level, on which modules of one kind depend alike; what a single anchor shows
+    of it is easily the direction from which the tag saw it. It is taken where it is three standard deviations
+    from none: a growth that noise made would do harm at distances that the drive did not have.
 
     Args:
         by_anchor: anchor id -> at least `MIN_RANGES` ranges; one anchor at least.
@@ -115,6 +125,11 @@ def fit_biases(by_anchor: Mapping[int, Ranges]) -> Calibration:
     Source: chen2019 section 1.1: mean of measured minus true distance in line of sight, fitted over it.
     """
     fits = {anchor_id: fit_anchor(ranges) for anchor_id, ranges in by_anchor.items()}
+    for _ in range(_GROWTH_ROUNDS):
+        growth, sigma = _common_growth(fits)
+        if abs(growth) <= _SIGNIFICANT * sigma:
+            return together({anchor_id: fit_anchor(ranges) for anchor_id, ranges in by_anchor.items()})
+        fits = {anchor_id: fit_anchor(ranges, growth, sigma) for anchor_id, ranges in by_anchor.items()}
     return together(fits)
 
 
@@ -128,53 +143,71 @@ def together(fits: dict[int, AnchorFit]) -> Calibration:
     )
 
 
-def fit_anchor(ranges: Ranges) -> AnchorFit:
-    """Line through an anchor's errors over the distance, blocked and failed ranges left out.
-
-    Growth with the distance is taken where it is three standard deviations from none; else the line is level:
-    a growth that noise made would do harm at distances that the drive did not have.
+def fit_anchor(ranges: Ranges, growth: float = 0.0, growth_sigma: float = 0.0) -> AnchorFit:
+    """Mean of an anchor's errors, blocked and failed ranges left out, beside a growth that is known.
 
     It begins at the mode of the errors. What is further from the line than `trim_limit` is left out, and the
-    line laid again until nothing changes. The uncertainty is that of errors which are alike
-    within a second (cluster-robust).
+    mean taken again until nothing changes. The uncertainty is that of errors which are alike within a second
+    (cluster-robust).
 
-    Source: line and trimming: standard least squares; covariance: Liang and Zeger, Biometrika 73(1), 1986.
+    Args:
+        ranges: of the anchor.
+        growth: of the bias with the distance [m/m].
+        growth_sigma: standard deviation of it.
+
+    Source: trimming: standard least squares; covariance: Liang and Zeger, Biometrika 73(1), 1986.
     """
     centre = float(ranges.distances.mean())
-    level = np.ones((len(ranges.distances), 1))
-    if ranges.distances.std() >= MIN_SPREAD:
-        sloping = _fit_line(ranges, np.column_stack([level, ranges.distances - centre]), centre)
-        if abs(sloping.bias.per_metre) > _SIGNIFICANT * sloping.per_metre_sigma:
-            return sloping
-    return _fit_line(ranges, level, centre)
-
-
-def _fit_line(ranges: Ranges, design: FloatArray, centre: float) -> AnchorFit:
-    errors = ranges.measured - ranges.distances
-    line: FloatArray = np.zeros(design.shape[1])
-    line[0] = half_sample_mode(errors)
+    errors = ranges.measured - ranges.distances - growth * (ranges.distances - centre)
+    constant = half_sample_mode(errors)
     kept = np.ones(len(errors), dtype=bool)
     limit = np.inf
     for _ in range(_ROUNDS):
-        off = errors - design @ line
-        # Never wider than before: else blocked ranges lift the line, which lets in more of them.
-        limit = min(limit, trim_limit(off))
-        kept_now = np.abs(off) <= limit
-        line[:] = np.linalg.lstsq(design[kept_now], errors[kept_now], rcond=None)[0]
+        # Never wider than before: else blocked ranges lift the mean, which lets in more of them.
+        limit = min(limit, trim_limit(errors - constant))
+        kept_now = np.abs(errors - constant) <= limit
+        constant = float(errors[kept_now].mean())
         if (kept_now == kept).all():
             break
         kept = kept_now
-    cov = _clustered_covariance(design[kept], (errors - design @ line)[kept], ranges.times[kept])
-    sigmas = np.sqrt(np.diag(cov))
-    has_slope = len(line) == 2
+    off = errors[kept] - constant
     return AnchorFit(
-        RangeBias(float(line[0]), float(line[1]) if has_slope else 0.0, centre),
-        float(sigmas[0]),
-        float(sigmas[1]) if has_slope else 0.0,
-        float((errors - design @ line)[kept].std()),
-        int(kept.sum()),
+        RangeBias(constant, growth, centre),
+        float(np.sqrt(_block_sums(off, ranges.times[kept]) / len(off) ** 2)),
+        growth_sigma,
+        float(off.std()),
+        kept,
         ranges,
     )
+
+
+def _common_growth(fits: Mapping[int, AnchorFit]) -> tuple[float, float]:
+    """Growth of all anchors' biases with the distance, and its standard deviation.
+
+    The second is infinite when the distances of no anchor differ enough to show a growth.
+    """
+    information = product = scatter = 0.0
+    told = []
+    for fit in fits.values():
+        distances = fit.ranges.distances[fit.kept]
+        if len(distances) and distances.std() >= MIN_SPREAD:
+            errors = fit.ranges.measured[fit.kept] - distances
+            lever = distances - distances.mean()
+            information += float(lever @ lever)
+            product += float(lever @ errors)
+            told.append((lever, errors - errors.mean(), fit.ranges.times[fit.kept]))
+    if not told:
+        return 0.0, np.inf
+    growth = product / information
+    for lever, errors, times in told:
+        scatter += _block_sums(lever * (errors - growth * lever), times)
+    return growth, float(np.sqrt(scatter)) / information
+
+
+def _block_sums(scores: FloatArray, times: FloatArray) -> float:
+    """Sum of the squares of the sums of scores (N,) over blocks of time."""
+    blocks = np.unique((times / _BLOCK).astype(np.int64), return_inverse=True)[1]
+    return float((np.bincount(blocks, scores) ** 2).sum())
 
 
 def trim_limit(errors: FloatArray) -> float:
@@ -199,11 +232,3 @@ def half_sample_mode(values: FloatArray) -> float:
         begin = int(np.argmin(np.subtract(ascending[half - 1 :], ascending[: len(ascending) - half + 1])))
         ascending = ascending[begin : begin + half]
     return float(np.mean(ascending))
-
-
-def _clustered_covariance(design: FloatArray, residuals: FloatArray, times: FloatArray) -> FloatArray:
-    blocks = np.unique((times / _BLOCK).astype(np.int64), return_inverse=True)[1]
-    scores = np.zeros((int(blocks.max()) + 1, design.shape[1]))
-    np.add.at(scores, blocks, design * residuals[:, None])
-    bread = np.linalg.pinv(design.T @ design)
-    return np.asarray(bread @ (scores.T @ scores) @ bread)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from companion.config import Config
 from companion.errors import UserError
 from companion.log import Direction, Log, Truth
-from companion.pipeline import make_parts, make_sensors
+from companion.pipeline import make_front_end, make_sensors
 from estimators.messages import Measurement, PoseIncrement, RangeFrame, Scan
 
 
@@ -41,7 +41,7 @@ def read_recording(log: Log, config: Config, until: float | None, with_odometry:
     """
     end_ns = None if until is None else log.start_ns + round(until * 1e9)
     recording = Recording(log.start_ns, [], [], [])
-    front_end, _ = make_parts(config, [])
+    front_end, _ = make_front_end(config, [])
     for measurement in _measurements(log, config, end_ns):
         if isinstance(measurement, Scan):
             increment = front_end.update(measurement) if with_odometry else None

@@ -18,11 +18,11 @@ from estimators.geometry import transform
 from estimators.messages import RangeFrame, Scan
 
 _LIAS_RANGES, _LIAS_MOTION = "UWB_dynamic_exp_fast.csv", "motion_capture_dynamic_exp_fast.csv"
-_LIAS_TAG, _LIAS_TAGS, _LIAS_ANCHORS = 1, 3, 8
-_LIAS_TAG_IN_TROLLEY = np.array([[-0.0750, 0.1402]])
+_LIAS_TAG, _LIAS_TAGS, _LIAS_ANCHORS = 0, 3, 8
+_LIAS_TAG_IN_TROLLEY = np.array([[-0.0689, -0.1423]])
 _LIAS_YAW_OFFSET = np.deg2rad(7.0)
-_LIAS_CLOCK_OFFSET_NS = 30_000_000
-"""UWB clock ahead of the motion capture's."""
+_LIAS_CLOCK_OFFSET_NS = 10_000_000
+"""UWB clock ahead of the motion capture's: 7, 4 and 18 ms by the ranges of tags 0, 1, 2 in the first 30 s."""
 _LABYRINTH_MEASURED, _LABYRINTH_TRUTH = "Indoor_UWB_Input.txt", "Indoor_UWB_GT.txt"
 _ROBOTINO_TRUTH = "_ref_scanmatch.csv"
 _ROBOTINO_BIAS = {177: 0.611, 178: -0.043, 180: -0.607}
@@ -31,7 +31,7 @@ _ROBOTINO_FIRST_BEAM, _ROBOTINO_STEP, _ROBOTINO_SCAN_S = -2.3562, 0.005817, 1.0 
 
 
 def lias_planar(folder: Path) -> Recording:
-    """LIAS-CUHKSZ, ICRA 2023: tag 1 of a trolley among eight anchors at 100 Hz; truth of the tag's position.
+    """LIAS-CUHKSZ, ICRA 2023: tag 0 of a trolley among eight anchors at 100 Hz; truth of the tag's position.
 
     Source: github.com/LIAS-CUHKSZ/Efficient-Pose-Estimation-via-UWB-measurements.
     """
@@ -41,7 +41,7 @@ def lias_planar(folder: Path) -> Recording:
         ranges = np.array(numbers(path, cells[1:])).reshape(_LIAS_ANCHORS, _LIAS_TAGS)[:, _LIAS_TAG]
         ids = np.flatnonzero(ranges > 0.0)
         none = np.full(len(ids), np.nan)
-        recording.ranges.append(RangeFrame(_lias_ns(cells[0]), 1, ids, ranges[ids], none, none))
+        recording.ranges.append(RangeFrame(_lias_ns(cells[0]), _LIAS_TAG, ids, ranges[ids], none, none))
     path = folder / _LIAS_MOTION
     for cells in rows(path, 8):
         x, y, _, qw, qx, qy, qz = numbers(path, cells[1:8])

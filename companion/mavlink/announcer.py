@@ -13,8 +13,6 @@ from drivers.mavlink_frames import MavlinkMessage
 
 LEAST_PAUSE_NS = 2_000_000_000
 """Between two texts; the newest state is told when it is over."""
-CHUNK = 50
-_LONGEST = 150
 _NUMBERS = re.compile(r"[\d.]+")
 
 
@@ -24,11 +22,10 @@ class Announcer:
     def __init__(self) -> None:
         self._told = ""
         self._due_ns = 0
-        self._id = 0
         self._waiting: list[tuple[int, str]] = []
 
     def say(self, severity: int, text: str) -> None:
-        """Tell something once, besides the state."""
+        """Tell something once, besides the state; a text has at most 50 characters."""
         self._waiting.append((severity, text))
 
     def poll(self, health: Health, decision: Decision, now_ns: int) -> list[MavlinkMessage]:
@@ -39,24 +36,14 @@ class Announcer:
             severity, text = self._waiting.pop(0)
         else:
             severity, text = _state_text(health, decision)
-            # Figures change with every tick: a change of words is a change.
-            words = _NUMBERS.sub("", text)
+            # Figures change with every tick, and which anchors are blocked often: a change of the operator's
+            # words is a change.
+            words = _NUMBERS.sub("", f"{health.state} {health.reason} {decision.held}")
             if words == self._told:
                 return []
             self._told = words
         self._due_ns = now_ns + LEAST_PAUSE_NS
-        return self._chunks(severity, text)
-
-    def _chunks(self, severity: int, text: str) -> list[MavlinkMessage]:
-        data = text.encode("ascii", "replace")[:_LONGEST]
-        if len(data) <= CHUNK:
-            return [mavlink2.MAVLink_statustext_message(severity, data, 0, 0)]
-        self._id = self._id % 0xFFFF + 1
-        # A chunk that is not full ends the text, so a full last one is followed by an empty one.
-        parts = [data[i : i + CHUNK] for i in range(0, len(data) + 1, CHUNK)]
-        return [
-            mavlink2.MAVLink_statustext_message(severity, part, self._id, i) for i, part in enumerate(parts)
-        ]
+        return [mavlink2.MAVLink_statustext_message(severity, text.encode("ascii", "replace"), 0, 0)]
 
 
 def _state_text(health: Health, decision: Decision) -> tuple[int, str]:
@@ -71,4 +58,5 @@ def _state_text(health: Health, decision: Decision) -> tuple[int, str]:
         State.DEGRADED: mavlink2.MAV_SEVERITY_WARNING,
         State.LOST: mavlink2.MAV_SEVERITY_ERROR,
     }[health.state]
-    return severity, f"pose {health.state}" + (f": {health.reason}" if health.reason else "")
+    why = health.brief or health.reason
+    return severity, f"pose {health.state}" + (f": {why}" if why else "")

@@ -77,7 +77,7 @@ class AutopilotContact:
                 was_far = self._origin.is_far
                 self._origin.hear(message)
                 if self._origin.is_far and not was_far:
-                    far = f"{self._origin.distance:.0f} m from the site's"
+                    far = f"{self._origin.distance:.0f} m away"
                     self._news.append(f"autopilot keeps another origin, {far}")
         return []
 

@@ -80,9 +80,12 @@ _FIXED = (
 _OF_THE_ESTIMATOR = {
     "EST_RANGE_SIGMA": "range_sigma",
     "EST_RANGE_GATE": "range_gate",
-    "EST_SUSPECT": "suspect_for",
     "EST_INCR_GATE": "increment_gate",
     "EST_ACCEL": "accel_noise",
+    "NLOS_EXCESS": "nlos_excess",
+    "NLOS_MEMORY": "nlos_memory",
+    "NLOS_POWER": "nlos_power",
+    "NLOS_OBST_HGT": "obstacle_height",
 }
 _CHOICE = Parameter("EST_CHOICE", "pipeline.estimator")
 
@@ -109,7 +112,9 @@ class ParameterServer:
             for name, key in _OF_THE_ESTIMATOR.items()
             if key in has
         ]
-        self._table = {p.name: p for p in [*_FIXED, _CHOICE, *tuned]}
+        # A start that is not known has no coordinates.
+        given = [p for p in (*_FIXED, _CHOICE, *tuned) if _setting(config, p) is not None]
+        self._table = {p.name: p for p in given}
         # Neither the set nor the order may change after the first answer.
         self._names = [*self._table, ALIGN]
         self._listed = len(self._names)

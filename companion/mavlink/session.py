@@ -269,7 +269,7 @@ class MavlinkSession:
 
     def _begin_alignment(self) -> None:
         if self.config.mavlink.align != "compass":
-            why = 'set mavlink.align = "compass" first'
+            why = 'set mavlink.align = "compass"'
         elif self._sent is not None and self.config.mavlink.heading:
             # The autopilot's heading may be ours by now: that would be measured against itself.
             why = "poses are being sent, restart first"

@@ -9,7 +9,6 @@ from itertools import chain, cycle
 
 import numpy as np
 import rerun as rr
-from scipy.stats import chi2
 
 from companion.config import Config
 from companion.view.anchor_marks import AnchorMarks
@@ -26,6 +25,7 @@ from companion.view.palette import (
     rgba,
     screen,
 )
+from estimators import chi2
 from estimators.geometry import transform_each
 from estimators.lidar.occupancy_grid import OccupancyGrid
 from estimators.messages import FloatArray, IntArray

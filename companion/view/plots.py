@@ -5,13 +5,13 @@ from itertools import cycle
 
 import numpy as np
 import rerun as rr
-from scipy.stats import chi2
 
 from companion.config import Config
 from companion.view.anchor_marks import anchor_colours
 from companion.view.batch import Batch
 from companion.view.entities import Entities
 from companion.view.palette import GREY, SENSORS, VERMILION, WHITE
+from estimators import chi2
 from estimators.messages import FloatArray, IntArray, PoseIncrement, RangeFrame, Scan, measurement_stamp_ns
 
 RATE_OVER_NS = 1_000_000_000
@@ -40,7 +40,7 @@ class Plots:
             entities.static(f"ranges/nis/A{i}", style)
         # Estimators that gate single ranges name the share that passes `range_gate`.
         share = getattr(config.estimator_config(self._primary), "range_gate", None)
-        self._gate = None if share is None else float(chi2.ppf(share, 1))
+        self._gate = None if share is None else chi2.ppf(share, 1)
 
     def send(self, batch: Batch) -> None:
         """Write a batch."""

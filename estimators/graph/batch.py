@@ -5,7 +5,8 @@ operator hit it. With anchors to be found, their places in the site file hold it
 `recording.PLACE_SIGMA`.
 
 Blocked ranges are found in rounds. A one-sided loss keeps them from doing much harm in the first; those that
-are then too long, and their neighbours in time, are left out of the next.
+are then too long, and their neighbours in time, are left out of the next. Loop closures are believed as far
+as they go together with the rest (`closures.solve_with_doubtful`).
 """
 
 from collections.abc import Callable
@@ -16,11 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimators.graph import factors
+from estimators.graph.closures import solve_with_doubtful
 from estimators.graph.errors import GraphError
 from estimators.graph.factors import Graph
 from estimators.graph.losses import GAUSSIAN
 from estimators.graph.recording import Recording
-from estimators.graph.solver import Solution, solve
+from estimators.graph.solver import Solution
 from estimators.messages import FloatArray, IntArray
 
 BoolArray: TypeAlias = NDArray[np.bool_]
@@ -67,6 +69,8 @@ class Smoothed:
         covs: (K, 3, 3) their covariance; infinite variance of a yaw that nothing tells.
         anchors: by id.
         iterations: steps of the solver, all rounds.
+        closures: loop closures that were used.
+        false_closures: loop closures that contradict the rest.
     """
 
     stamps_ns: IntArray
@@ -74,6 +78,8 @@ class Smoothed:
     covs: FloatArray
     anchors: dict[int, AnchorFix]
     iterations: int
+    closures: int
+    false_closures: int
 
 
 def smooth(
@@ -107,9 +113,10 @@ def smooth(
     plain = recording.ranges.copy()
     plain[:, factors.RANGE_LOSS] = GAUSSIAN.kind
     solution, used, iterations = None, np.zeros(len(plain), dtype=np.bool_), 0
+    believed = np.ones(len(recording.closures))
     for number in range(_ROUNDS):
         on_round(number)
-        solution = solve(graph)
+        solution, believed = solve_with_doubtful(graph, recording.closures)
         iterations += solution.iterations
         blocked = _blocked(range_residuals(solution.values, plain) / plain[:, 3], recording)
         if number > 0 and (used == ~blocked).all():
@@ -118,7 +125,7 @@ def smooth(
             used = ~blocked
             graph = replace(graph, values=solution.values, ranges=plain[used])
     assert solution is not None
-    return _told(recording, graph, solution, used, iterations)
+    return _told(recording, graph, solution, used, iterations, believed)
 
 
 def range_residuals(values: FloatArray, rows: FloatArray) -> FloatArray:
@@ -148,7 +155,12 @@ def _blocked(residuals: FloatArray, recording: Recording) -> BoolArray:
 
 
 def _told(
-    recording: Recording, graph: Graph, solution: Solution, used: BoolArray, iterations: int
+    recording: Recording,
+    graph: Graph,
+    solution: Solution,
+    used: BoolArray,
+    iterations: int,
+    believed: FloatArray,
 ) -> Smoothed:
     covs, residuals = solution.covariances(graph.free), range_residuals(solution.values, recording.ranges)
     anchors = {}
@@ -169,4 +181,13 @@ def _told(
     pose_covs = covs[of_poses].copy()
     if not recording.heading_known:
         pose_covs[:, 2, 2] = np.inf
-    return Smoothed(recording.stamps_ns, solution.values[of_poses], pose_covs, anchors, iterations)
+    closures = int((believed > 0.5).sum())
+    return Smoothed(
+        recording.stamps_ns,
+        solution.values[of_poses],
+        pose_covs,
+        anchors,
+        iterations,
+        closures,
+        len(believed) - closures,
+    )

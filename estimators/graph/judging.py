@@ -13,8 +13,9 @@ from estimators.base import Report, Verdict
 from estimators.geometry import wrap_angle
 from estimators.graph import factors
 from estimators.landmark_gate import LandmarkGate
-from estimators.messages import FloatArray, LandmarkFrame, RangeFrame
+from estimators.messages import FloatArray, LandmarkFrame, LoopClosure, PoseIncrement, RangeFrame
 from estimators.models.landmark import range_and_bearing
+from estimators.models.motion import increment
 from estimators.models.range import horizontal_range
 from estimators.range_gate import HorizontalRanges, RangeGate
 
@@ -137,6 +138,36 @@ def judge_landmarks(
     if not rows:
         return Verdict.GATED, np.empty((0, factors.SIGHTING))
     return Verdict.ACCEPTED, factors.sightings(-1, *np.array(rows).T)
+
+
+def motion_nis(
+    measured: PoseIncrement | LoopClosure, reference: FloatArray, pose: FloatArray, cov: FloatArray
+) -> float:
+    """Normalised innovation squared of a motion between two poses that are known together.
+
+    Args:
+        measured: the motion.
+        reference: (3,) pose where it begins.
+        pose: (3,) pose where it ends.
+        cov: (9, 9) covariance of this pose, its velocity and the reference.
+    """
+    predicted, by_reference, by_pose = increment(reference, pose)
+    H = np.zeros((3, 9))
+    H[:, :3], H[:, 6:] = by_pose, by_reference
+    return increment_nis(measured, predicted, H @ cov @ H.T)
+
+
+def increment_nis(measured: PoseIncrement | LoopClosure, predicted: FloatArray, spread: FloatArray) -> float:
+    """Normalised innovation squared of a motion.
+
+    Args:
+        measured: the motion.
+        predicted: (3,) what it was thought to be.
+        spread: (3, 3) covariance of that.
+    """
+    residual = measured.increment - predicted
+    residual[2] = wrap_angle(residual[2])
+    return float(residual @ np.linalg.solve(spread + measured.cov, residual))
 
 
 def _range_rows(believed: Sequence[tuple[int, float, float]], arm: FloatArray) -> FloatArray:

@@ -1,8 +1,8 @@
 """When a correction is a jump that `PoseEstimate.reset_counter` counts, as it does poses set from outside."""
 
 import numpy as np
-from scipy.stats import chi2
 
+from estimators import chi2
 from estimators.geometry import wrap_angle
 from estimators.messages import FloatArray
 

@@ -9,12 +9,13 @@ from estimators.base import Setup
 from estimators.graph import factors
 from estimators.graph.errors import GraphError
 from estimators.graph.factors import DensePrior, Graph
-from estimators.graph.losses import Loss, LossKind
+from estimators.graph.losses import GAUSSIAN, Loss, LossKind
 from estimators.lidar.keyframes import START_SPEED_SIGMA, is_covariance
 from estimators.messages import (
     FloatArray,
     IntArray,
     LandmarkFrame,
+    LoopClosure,
     Measurement,
     PoseIncrement,
     RangeFrame,
@@ -55,6 +56,7 @@ class Recording:
         anchor_ids: of the first variables, in their order.
         ranges: (M, 9) rows of `factors.ranges`.
         range_stamps_ns: (M,) their instants.
+        closures: (D,) which rows of the graph's increments are loop closures.
         heading_known: False when nothing measured turns with the robot.
 
     Args:
@@ -80,9 +82,12 @@ class Recording:
         self._landmarks = {i: len(setup.anchors) + k for k, i in enumerate(setup.landmarks)}
         self._known = len(setup.anchors) + len(setup.landmarks)
         steps = [m for m in measurements if isinstance(m, PoseIncrement) and _is_step(m)]
+        closures = [m for m in measurements if isinstance(m, LoopClosure) and _is_step(m)]
         frames = [m for m in measurements if isinstance(m, RangeFrame)]
         looks = [m for m in measurements if isinstance(m, LandmarkFrame)]
-        instants = [stamp_ns for m in steps for stamp_ns in (m.from_stamp_ns, m.stamp_ns)]
+        ends = [(m.from_stamp_ns, m.stamp_ns) for m in steps]
+        ends += [(m.from_stamp_ns, m.stamp_ns) for m in closures]
+        instants = [stamp_ns for pair in ends for stamp_ns in pair]
         instants += [m.stamp_ns for m in frames] + [m.stamp_ns for m in looks]
         self.stamps_ns = _apart(np.unique(np.array(instants, dtype=np.int64)))
         if len(self.stamps_ns) < 2:
@@ -95,7 +100,9 @@ class Recording:
         self._sightings = np.concatenate(
             [np.empty((0, factors.SIGHTING)), *(self._sighting_rows(look) for look in looks)]
         )
-        self._increments = self._increment_rows(steps)
+        odometry = self._increment_rows(steps, _INCREMENT_LOSS)
+        self._increments = np.concatenate([odometry, self._increment_rows(closures, GAUSSIAN)])
+        self.closures = np.arange(len(odometry), len(self._increments))
         turning = len(self._increments) + len(self._sightings) + np.abs(self.ranges[:, 4:6]).sum()
         self.heading_known = bool(turning > 0.0)
 
@@ -183,17 +190,17 @@ class Recording:
         whole = np.isfinite(rows).all(axis=1) & (rows[:, [2, 4, 5]] > 0.0).all(axis=1)
         return np.asarray(rows[whole])
 
-    def _increment_rows(self, steps: Sequence[PoseIncrement]) -> FloatArray:
+    def _increment_rows(self, steps: Sequence[PoseIncrement | LoopClosure], loss: Loss) -> FloatArray:
         if not steps:
             return np.empty((0, factors.INCREMENT))
         ends = [self._variable(np.array([m.from_stamp_ns, m.stamp_ns])) for m in steps]
         first, second = np.array(ends).T
         measured, covs = np.array([m.increment for m in steps]), np.array([m.cov for m in steps])
-        rows = factors.increments(first, second, measured, covs, _INCREMENT_LOSS)
+        rows = factors.increments(first, second, measured, covs, loss)
         return np.asarray(rows[first != second])
 
 
-def _is_step(measured: PoseIncrement) -> bool:
+def _is_step(measured: PoseIncrement | LoopClosure) -> bool:
     return (
         measured.from_stamp_ns < measured.stamp_ns
         and bool(np.isfinite(measured.increment).all())

@@ -9,7 +9,6 @@ import numpy as np
 from pydantic import Field
 
 from estimators.base import Report, Setup, Sketch, Verdict
-from estimators.geometry import lift, wrap_angle
 from estimators.graph import factors
 from estimators.graph.errors import GraphError
 from estimators.graph.jumps import is_jump
@@ -19,6 +18,7 @@ from estimators.lidar.odometry import MAX_HEADING_SIGMA
 from estimators.messages import (
     FloatArray,
     LandmarkFrame,
+    LoopClosure,
     Measurement,
     PoseEstimate,
     PoseIncrement,
@@ -47,6 +47,13 @@ class GraphSmoother(KeyframeTracker):
         """Settings of `graph`."""
 
         lag: float = Field(3.0, gt=0, le=60, description="the window reaches back so far [s]")
+        places: int = Field(
+            10,
+            ge=0,
+            le=200,
+            description="poses of so many places, the newest, stay in it for loop closures; the time of an "
+            "update grows with their square",
+        )
 
     def __init__(self, config: Config, setup: Setup) -> None:
         # Numba loads slowly: only who makes a smoother waits for it.
@@ -55,6 +62,7 @@ class GraphSmoother(KeyframeTracker):
         super().__init__(config, setup)
         self._fixed_lag, self._judging = fixed_lag, judging
         self._lag_ns = round(config.lag * 1e9)
+        self._most_places = config.places
         self._gate = RangeGate(config, setup)
         self._landmark_gate = LandmarkGate(config, setup)
         self._anchor_numbers = {anchor_id: i for i, anchor_id in enumerate(setup.anchors)}
@@ -78,6 +86,8 @@ class GraphSmoother(KeyframeTracker):
             if not isinstance(measurement, PoseIncrement):
                 self._predict_to(measurement.stamp_ns)
                 return self._judge(measurement, *self._predicted(measurement.stamp_ns))
+        if isinstance(measurement, LoopClosure):
+            return self._update_closure(measurement)
         report = super().update(measurement)
         self._gate.see(measurement, self.pose_at)
         return report
@@ -90,12 +100,7 @@ class GraphSmoother(KeyframeTracker):
         if self._stamp_ns is None:
             return None
         mean, cov = self._predicted(stamp_ns)
-        cov = cov[POSE, POSE].copy()
-        if not self._heading_known:
-            cov[2, :2] = cov[:2, 2] = 0.0
-            cov[2, 2] = np.inf
-        T_map_body = lift(mean[POSE], self._setup.height)
-        return PoseEstimate(stamp_ns, T_map_body, self._setup.lift_covariance(cov), self._reset_counter)
+        return self._estimate(stamp_ns, mean[STATE], cov[STATE, STATE], self._heading_known)
 
     def sketch(self) -> Sketch:
         """The poses of the window, and which of them are keyframes."""
@@ -118,6 +123,7 @@ class GraphSmoother(KeyframeTracker):
         stamp_ns = self._stamp_ns
         self._begin_window(0 if stamp_ns is None else stamp_ns)
         self._keyframes: dict[int, int] = {} if stamp_ns is None else {stamp_ns: stamp_ns}
+        self._places: dict[int, int] = {}
 
     def _set_speed_free(self) -> None:
         """Its speed always is; while it stands, nothing is predicted with it."""
@@ -135,13 +141,11 @@ class GraphSmoother(KeyframeTracker):
         if self._stands:
             self._window.stamps_ns[-1] = stamp_ns
             self._keyframes = dict.fromkeys(self._keyframes, stamp_ns)
+            self._places = dict.fromkeys(self._places, stamp_ns)
 
     def _follow(self, measured: PoseIncrement) -> Report:
         mean, cov = self._predicted(measured.stamp_ns)
-        predicted, by_reference, by_pose = increment(mean[REFERENCE], mean[POSE])
-        H = np.zeros((3, 9))
-        H[:, POSE], H[:, REFERENCE] = by_pose, by_reference
-        nis = _increment_nis(measured, predicted, H @ cov @ H.T)
+        nis = self._judging.motion_nis(measured, mean[REFERENCE], mean[POSE], cov)
         passes = nis <= self._increment_gate and self._take_increment(measured)
         return Report((Verdict.ACCEPTED if passes else Verdict.GATED,), np.full(1, np.nan), np.array([nis]))
 
@@ -200,12 +204,42 @@ class GraphSmoother(KeyframeTracker):
                 predicted, by_reference, by_pose = increment(earlier[POSE], later[POSE])
                 spread = by_reference @ cov_earlier[POSE, POSE] @ by_reference.T
                 spread += by_pose @ cov_later[POSE, POSE] @ by_pose.T
-                passes = _increment_nis(measured, predicted, spread) <= self._increment_gate
+                passes = self._judging.increment_nis(measured, predicted, spread) <= self._increment_gate
                 if not (passes and self._take_increment(measured)):
                     verdict = Verdict.GATED
         if measured.is_keyframe:
             self._keep_keyframe(measured.stamp_ns)
         return verdict
+
+    def _update_closure(self, measured: LoopClosure) -> Report:
+        """Take a closure at the newest keyframe, if its place is still in the window.
+
+        The place stayed there as a node, so what its pose and that of now have in common is known, and
+        nothing is counted twice.
+        """
+        node_ns = self._keyframes.get(measured.stamp_ns)
+        if node_ns is None or node_ns != self._window.stamps_ns[-1]:
+            return Report((Verdict.NO_REFERENCE,))
+        if measured.from_stamp_ns == measured.stamp_ns:
+            self._places[measured.stamp_ns] = node_ns
+            while len(self._places) > self._most_places:
+                del self._places[next(iter(self._places))]
+            return Report((Verdict.ACCEPTED,))
+        if not (np.isfinite(measured.increment).all() and is_covariance(measured.cov)):
+            return Report((Verdict.IMPOSSIBLE,))
+        place = self._window.node_at(self._places.get(measured.from_stamp_ns, -1))
+        if place is None or place == len(self._window.stamps_ns) - 1:
+            return Report((Verdict.NO_REFERENCE,))
+        try:
+            cov = self._window.update(place)
+        except GraphError:
+            return Report((Verdict.GATED,))
+        variable = self._window.variable(place)
+        at, now = self._window.graph.values[variable], self._window.newest[0]
+        nis = self._judging.motion_nis(measured, at, now, cov)
+        rows = factors.increments(variable, -1, measured.increment, measured.cov)
+        passes = nis <= self._increment_gate and self._take(measured.stamp_ns, "increments", rows)
+        return Report((Verdict.ACCEPTED if passes else Verdict.GATED,), np.full(1, np.nan), np.array([nis]))
 
     def _take_increment(self, measured: PoseIncrement) -> bool:
         node = self._node_of(measured.stamp_ns)
@@ -233,7 +267,7 @@ class GraphSmoother(KeyframeTracker):
             cov = window.update(reference)
         except GraphError:
             self._begin_window(int(window.stamps_ns[-1]))
-            self._keyframes = {}
+            self._keyframes, self._places = {}, {}
             self._reference_stamp_ns = None
             return False
         mean = window.newest.ravel()
@@ -247,10 +281,12 @@ class GraphSmoother(KeyframeTracker):
         if self._stands:
             window.absorb()
             return True
-        kept = () if self._reference_stamp_ns is None else (self._keyframes.get(self._reference_stamp_ns, 0),)
+        kept = [*self._places.values()]
+        if self._reference_stamp_ns is not None:
+            kept.append(self._keyframes.get(self._reference_stamp_ns, 0))
         window.drop_before(int(window.stamps_ns[-1]) - self._lag_ns, kept)
-        oldest_ns = window.stamps_ns[0]
-        self._keyframes = {k: node_ns for k, node_ns in self._keyframes.items() if node_ns >= oldest_ns}
+        nodes_ns = set(window.stamps_ns.tolist())
+        self._keyframes = {k: node_ns for k, node_ns in self._keyframes.items() if node_ns in nodes_ns}
         return True
 
     def _begin_window(self, stamp_ns: int) -> None:
@@ -299,10 +335,3 @@ class GraphSmoother(KeyframeTracker):
     def _node_of_keyframe(self, stamp_ns: int | None) -> int | None:
         node_ns = None if stamp_ns is None else self._keyframes.get(stamp_ns)
         return None if node_ns is None else self._window.node_at(node_ns)
-
-
-def _increment_nis(measured: PoseIncrement, predicted: FloatArray, spread: FloatArray) -> float:
-    """Normalised innovation squared of an increment, whose prediction has a covariance (3, 3)."""
-    residual = measured.increment - predicted
-    residual[2] = wrap_angle(residual[2])
-    return float(residual @ np.linalg.solve(spread + measured.cov, residual))

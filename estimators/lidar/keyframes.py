@@ -4,10 +4,11 @@ from abc import ABC, abstractmethod
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
-from scipy.stats import chi2
 
+from estimators import chi2
 from estimators.base import Report, Setup, Verdict
-from estimators.messages import FloatArray, Measurement, PoseIncrement, RangeFrame
+from estimators.geometry import lift
+from estimators.messages import FloatArray, Measurement, PoseEstimate, PoseIncrement, RangeFrame
 
 START_SPEED_SIGMA = 0.3
 """Standard deviation of each velocity when the robot sets off [m/s, rad/s]."""
@@ -113,6 +114,33 @@ class KeyframeTracker(ABC):
         if self._stands:
             self._stands = False
             self._set_speed_free()
+
+    def _estimate(
+        self, stamp_ns: int, state: FloatArray, cov: FloatArray, heading_known: bool = True
+    ) -> PoseEstimate:
+        """What is given out of a state.
+
+        Args:
+            stamp_ns: for which it holds.
+            state: (6,) x [m], y [m], yaw [rad] and their rates, along the map's axes.
+            cov: (6, 6) of the same.
+            heading_known: False makes the variance of yaw infinite.
+        """
+        planar = cov[:3, :3].copy()
+        if not heading_known:
+            planar[2, :2] = planar[:2, 2] = 0.0
+            planar[2, 2] = np.inf
+        # It walks level: what it does upward is as uncertain as its height within a second.
+        velocity_cov = np.diag([0.0, 0.0, self._setup.height_sigma**2])
+        velocity_cov[:2, :2] = cov[3:5, 3:5]
+        return PoseEstimate(
+            stamp_ns,
+            lift(state[:3], self._setup.height),
+            self._setup.lift_covariance(planar),
+            self._reset_counter,
+            velocity=np.array([state[3], state[4], 0.0]),
+            velocity_cov=velocity_cov,
+        )
 
     def _is_late(self, stamp_ns: int) -> bool:
         return self._stamp_ns is not None and stamp_ns < self._stamp_ns

@@ -1,6 +1,7 @@
 """Where a LiDAR saw something and where it saw through: log-odds of square cells in the map frame."""
 
 from math import log
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,8 @@ MAX_SIDE = 4096
 """A scan that would need more cells along a side is left out: only a lost robot takes such a scan."""
 LIMIT = log(0.97 / 0.03)
 """No cell is surer than this, so that what moves away is forgotten."""
+
+Point: TypeAlias = tuple[float, float] | FloatArray
 
 
 class OccupancyGrid:
@@ -104,11 +107,17 @@ class OccupancyGrid:
         )
         return True
 
-    def blocked(self, start: FloatArray, end: FloatArray) -> bool:
-        """Whether an obstacle lies on the straight line between two points (2,) [m], map frame."""
-        x, y = start / self._cell - self._corner
-        end_x, end_y = end / self._cell - self._corner
-        blocked: bool = self._kernels.is_blocked(self._log_odds, x, y, end_x, end_y, self._threshold)
+    def blocked(self, start: Point, end: Point) -> bool:
+        """Whether an obstacle lies on the straight line between two points (x, y) [m], map frame."""
+        cell, (column, row) = self._cell, self._corner.tolist()
+        blocked: bool = self._kernels.is_blocked(
+            self._log_odds,
+            start[0] / cell - column,
+            start[1] / cell - row,
+            end[0] / cell - column,
+            end[1] / cell - row,
+            self._threshold,
+        )
         return blocked
 
     def _grow(self, least: FloatArray, greatest: FloatArray) -> bool:

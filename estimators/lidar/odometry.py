@@ -9,7 +9,7 @@ import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
 
 from estimators.base import Report, Setup, Verdict
-from estimators.geometry import lift, wrap_angle
+from estimators.geometry import wrap_angle
 from estimators.lidar.keyframes import START_SPEED_SIGMA, KeyframeTracker
 from estimators.messages import FloatArray, PoseEstimate, PoseIncrement
 from estimators.models.motion import constant_velocity, increment
@@ -51,24 +51,8 @@ class LidarOdometry(KeyframeTracker):
         if self._stamp_ns is None:
             return None
         F, Q = self._motion(0.0 if self._stands else (stamp_ns - self._stamp_ns) * 1e-9)
-        mean = F @ self._filter.x[MOVING]
-        moving_cov = F @ self._filter.P[MOVING, MOVING] @ F.T + Q
-        cov = moving_cov[POSE, POSE]
-        if not self._heading_known:
-            cov[2, :2] = cov[:2, 2] = 0.0
-            cov[2, 2] = np.inf
-        T_map_body = lift(mean[POSE], self._setup.height)
-        # It walks level: what it does upward is as uncertain as its height within a second.
-        velocity_cov = np.diag([0.0, 0.0, self._setup.height_sigma**2])
-        velocity_cov[:2, :2] = moving_cov[3:5, 3:5]
-        return PoseEstimate(
-            stamp_ns,
-            T_map_body,
-            self._setup.lift_covariance(cov),
-            self._reset_counter,
-            velocity=np.array([mean[3], mean[4], 0.0]),
-            velocity_cov=velocity_cov,
-        )
+        cov = F @ self._filter.P[MOVING, MOVING] @ F.T + Q
+        return self._estimate(stamp_ns, F @ self._filter.x[MOVING], cov, self._heading_known)
 
     def _motion(self, dt: float) -> tuple[FloatArray, FloatArray]:
         return constant_velocity(dt, *self._accel_noise)

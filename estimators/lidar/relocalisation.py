@@ -7,8 +7,8 @@ from typing import TypeAlias
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 from scipy.ndimage import map_coordinates, maximum_filter
-from scipy.stats import chi2
 
+from estimators import chi2
 from estimators.base import Setup
 from estimators.geometry import compose, rotation
 from estimators.lidar.floor_map import FloorMap

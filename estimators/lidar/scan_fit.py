@@ -168,7 +168,9 @@ def said_by_scan(prior: FloatArray, predicted: FloatArray, fit: Fit) -> tuple[Fl
     Source: Bar-Shalom et al., Tracking and Data Fusion, 9.5: tracklets by decorrelation.
     """
     expected, known = _marginal(prior), _marginal(fit.information)
-    cov = np.asarray(np.linalg.inv(known - expected + LEAST_INFORMATION * np.eye(3)), dtype=np.float64)
+    # What walls hold tells of the rest by what the motion model thinks of both: that is not the scan's.
+    gained = fit.held @ (known - expected) @ fit.held
+    cov = np.asarray(np.linalg.inv(gained + LEAST_INFORMATION * np.eye(3)), dtype=np.float64)
     correction = cov @ known @ (fit.states[NEWEST] - predicted[NEWEST])
     pose = predicted[NEWEST] + correction @ fit.held
     pose[2] = wrap_angle(pose[2])

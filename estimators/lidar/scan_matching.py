@@ -15,10 +15,11 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from estimators.geometry import inverse, rotation, transform, transform_each
+from estimators.lidar.expectation import MotionNoise, expect
+from estimators.lidar.known_motion import GyroTrack, OdometryTrack
 from estimators.lidar.scan_fit import NEWEST, said_by_scan, search_start, settle
 from estimators.lidar.scan_preparation import PreparedScan, ScanPreparation
-from estimators.messages import FloatArray, Measurement, PoseIncrement, Scan
-from estimators.models.motion import cubic_between, smooth_motion
+from estimators.messages import FloatArray, ImuSample, Measurement, PoseIncrement, Scan
 
 if TYPE_CHECKING:
     from estimators.lidar.line_map import LineMap, Surface
@@ -97,6 +98,13 @@ class ScanMatcher:
         stamp_sigma_ms: float = Field(
             1.0, ge=0, le=100, description="standard deviation of a scan's stamp [ms]"
         )
+        gyro_sigma: float = Field(
+            0.0,
+            ge=0,
+            le=1,
+            description="standard deviation of the gyroscope's yaw rate, bias included [rad/s]; its axes are "
+            "the body's; 0: no gyroscope is used",
+        )
 
     def __init__(
         self, config: Config, T_body_lidar: FloatArray, preparation: ScanPreparation.Config | None = None
@@ -114,13 +122,20 @@ class ScanMatcher:
         self._line_map = line_map
         self._config = config
         self._T_body_lidar = T_body_lidar
+        self._noise = MotionNoise(
+            config.accel_noise, config.yaw_accel_noise, config.bandwidth, config.gyro_sigma
+        )
+        self.odometry = OdometryTrack((config.accel_noise, config.yaw_accel_noise))
+        """Of others, where there is one."""
+        self._gyro = GyroTrack()
         self._preparation = ScanPreparation(preparation or ScanPreparation.Config(), T_body_lidar)
         self._keyframe: LineMap | None = None
-        self._keyframe_ns = 0
         self._keyframe_is_blind = False
         self._stamp_ns = 0
         self._state = np.zeros(6)
         self._cov = np.zeros((6, 6))
+        self.keyframe_ns = 0
+        """Time of the newest keyframe."""
         self.points = np.empty((0, 2))
         """(N, 2) [m] of the newest scan, as seen from where the body is at its end."""
         self.points_cov = np.zeros((3, 3))
@@ -129,7 +144,7 @@ class ScanMatcher:
         """Scans that could not be matched, so that odometry began anew."""
 
     def update(self, measurement: Measurement) -> PoseIncrement | None:
-        """Match a scan; of other measurements, remember what the preparation needs.
+        """Match a scan; of other measurements, remember what they say of motion and attitude.
 
         Returns:
             The increment from the keyframe to the end of this scan. The first scan, and a scan after
@@ -137,7 +152,7 @@ class ScanMatcher:
             with too few returns, and for one that is not newer than the last.
         """
         if not isinstance(measurement, Scan):
-            self._preparation.observe(measurement)
+            self._observe(measurement)
             return None
         stamp_ns = measurement.end_stamp_ns
         if self._keyframe is not None and stamp_ns < self._stamp_ns + LEAST_GAP_NS:
@@ -156,19 +171,40 @@ class ScanMatcher:
         # A keyframe that was taken without knowing the speed is distorted, so it is left at once.
         is_keyframe = self._keyframe_is_blind or self._moved_far() or match.share < KEYFRAME_SHARE
         cov = match.increment_cov + self.points_cov
-        increment = PoseIncrement(self._keyframe_ns, stamp_ns, match.increment, cov, is_keyframe)
+        increment = PoseIncrement(self.keyframe_ns, stamp_ns, match.increment, cov, is_keyframe)
         if is_keyframe:
             self._found_keyframe(is_blind=False)
         return increment
 
+    def forget(self) -> None:
+        """The next scan founds a keyframe."""
+        self._keyframe = None
+
+    def _observe(self, measurement: Measurement) -> None:
+        if isinstance(measurement, PoseIncrement):
+            self.odometry.add(measurement)
+        elif isinstance(measurement, ImuSample):
+            if self._noise.gyro_sigma:
+                self._gyro.add(measurement)
+        else:
+            self._preparation.observe(measurement)
+
     def _begin(self, scan: PreparedScan) -> PoseIncrement:
-        """Found a keyframe where nothing is known of the motion."""
+        """Found a keyframe where no scan tells of the motion."""
         self._stamp_ns, self.points = scan.stamp_ns, scan.points
-        self._state = np.zeros(6)
-        # The points are displaced by up to half of the way during the scan, which is not known.
-        displaced = -0.5 * UNKNOWN_SPEED_SIGMA * float(scan.times[0])
-        self._cov = np.diag([displaced**2 + _LEAST_VARIANCE] * 3 + [UNKNOWN_SPEED_SIGMA**2] * 3)
-        self._found_keyframe(is_blind=True)
+        duration = -float(scan.times[0])
+        known = self.odometry.motion(scan.stamp_ns - round(duration * 1e9), scan.stamp_ns)
+        self._state, self._cov = np.zeros(6), np.zeros((6, 6))
+        if known is None:
+            # The points are displaced by up to half of the way during the scan, which is not known.
+            displaced = 0.5 * UNKNOWN_SPEED_SIGMA * duration
+            self._cov = np.diag([displaced**2] * 3 + [UNKNOWN_SPEED_SIGMA**2] * 3)
+        else:
+            self.points = transform_each(self.odometry.beams(scan.stamp_ns, scan.times), scan.points)
+            self._state[3:] = self.odometry.twist()
+            self._cov[:3, :3], self._cov[3:, 3:] = known[1] / 3.0, known[1] / max(duration, 1e-3) ** 2
+        self._cov += _LEAST_VARIANCE * np.eye(6)
+        self._found_keyframe(is_blind=known is None)
         return PoseIncrement(scan.stamp_ns, scan.stamp_ns, np.zeros(3), np.zeros((3, 3)), is_keyframe=True)
 
     def _found_keyframe(self, *, is_blind: bool) -> None:
@@ -179,7 +215,7 @@ class ScanMatcher:
         """
         config = self._config
         self._keyframe = self._line_map.LineMap(self.points, config.range_sigma, config.max_correspondence)
-        self._keyframe_ns, self._keyframe_is_blind = self._stamp_ns, is_blind
+        self.keyframe_ns, self._keyframe_is_blind = self._stamp_ns, is_blind
         turn = np.eye(6)
         turn[:2, :2] = turn[3:5, 3:5] = rotation(-self._state[2])
         self._state = turn @ self._state
@@ -197,33 +233,42 @@ class ScanMatcher:
         """Put a scan where it fits; leaves the deskewed points in `points` when it does."""
         config = self._config
         dt = (scan.stamp_ns - self._stamp_ns) * 1e-9
-        every_basis = cubic_between(1.0 + scan.times / dt, dt)
-        found = self._line_map.surface(scan.points, config.range_sigma)
-        basis = every_basis[found.own]
-        F, Q = smooth_motion(dt, config.accel_noise, config.yaw_accel_noise, config.bandwidth)
+        expected = expect(
+            scan, self._stamp_ns, self._state, self._cov, self._noise, self.odometry, self._gyro
+        )
+        found = self._line_map.surface(expected.points, config.range_sigma)
+        basis = expected.basis[found.own]
+        F, Q = expected.F, expected.Q
         motion = np.hstack([-F, np.eye(6)])
         prior = motion.T @ np.linalg.solve(Q, motion)
-        prior[:6, :6] += np.linalg.inv(self._cov)
-        predicted = np.concatenate([self._state, F @ self._state])
-        doubt = np.sqrt(np.diag(F @ self._cov @ F.T + Q)[:3])
+        prior[:6, :6] += np.linalg.inv(expected.cov)
+        predicted = np.concatenate([expected.state, F @ expected.state])
+        doubt = np.sqrt(np.diag(F @ expected.cov @ F.T + Q)[:3])
         start = search_start(keyframe, found, basis, predicted, doubt, dt, config.max_correspondence)
         fit = settle(keyframe, found, basis, prior, predicted, start, self._ranges_to_walls(found))
         if fit is None:
             return None
         # A bare wall looks the same everywhere: after a long gap it is only known to be one when all fits.
-        wandered = config.accel_noise * np.sqrt(dt**3 / 3.0)
+        wandered = float(np.sqrt(Q[0, 0]))
         is_another = wandered > config.max_correspondence and np.linalg.matrix_rank(fit.held, tol=0.5) < 3
         if fit.share < config.min_inlier_share or is_another:
             return None
 
-        in_keyframe = transform_each(every_basis @ fit.states.reshape(4, 3), scan.points)
-        self.points = transform(inverse(fit.states[NEWEST]), in_keyframe)
+        states = fit.states
+        in_keyframe = transform_each(expected.basis @ states.reshape(4, 3), expected.points)
+        self.points = transform(inverse(states[NEWEST]), in_keyframe)
         increment, cov = said_by_scan(prior, predicted, fit)
-        velocity = fit.states[9:]
+        rows, index = keyframe.match(found.points, found.normals, basis, states)
+        bent = expected.bent(1.0 + scan.times[found.own][index >= 0] / dt, rows[index >= 0, 1:4])
+        states[9:11] += rotation(states[8]) @ expected.twist[:2]
+        states[11] += expected.twist[2]
+        velocity = states[9:]
         cov += (1e-3 * config.stamp_sigma_ms) ** 2 * np.outer(velocity, velocity)
+        cov += bent
         cov_of_state = np.linalg.inv(fit.information)[6:, 6:]
+        cov_of_state[:3, :3] += bent
         return _Match(
-            fit.states, 0.5 * (cov_of_state + cov_of_state.T), increment, 0.5 * (cov + cov.T), fit.share
+            states, 0.5 * (cov_of_state + cov_of_state.T), increment, 0.5 * (cov + cov.T), fit.share
         )
 
     def _ranges_to_walls(self, found: "Surface") -> float:

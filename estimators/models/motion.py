@@ -4,7 +4,7 @@ from math import cos, pi, sin
 
 import numpy as np
 
-from estimators.geometry import between
+from estimators.geometry import between, compose
 from estimators.messages import FloatArray
 
 
@@ -123,3 +123,25 @@ def constant_acceleration(dt: float, jerk_noise: float) -> tuple[FloatArray, Flo
     )
     Q: FloatArray = np.kron(by_axis, np.eye(2)).astype(np.float64)
     return F, Q
+
+
+def chained(
+    moved: FloatArray, cov: FloatArray, step: FloatArray, step_cov: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """A motion and a further one as a single motion, their errors being independent.
+
+    Args:
+        moved: (3,) first motion.
+        cov: (3, 3) its covariance.
+        step: (3,) further motion, in the body frame at the end of the first.
+        step_cov: (3, 3) its covariance.
+
+    Returns:
+        Both as one (3,), and its covariance (3, 3).
+
+    Source: Smith, Self and Cheeseman, "Estimating uncertain spatial relationships in robotics", 1990, 3.2.
+    """
+    c, s = cos(moved[2]), sin(moved[2])
+    by_moved, by_step = np.eye(3), np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    by_moved[0, 2], by_moved[1, 2] = -s * step[0] - c * step[1], c * step[0] - s * step[1]
+    return compose(moved, step), by_moved @ cov @ by_moved.T + by_step @ step_cov @ by_step.T

@@ -134,26 +134,23 @@ class Recovering:
             if placed is None or len(placed.ranges) in (tried, 0):
                 break
             tried = len(placed.ranges)
-            held = None if estimate is None else self._at_keyframe(estimate)
-            if held is not None and float(total_loss(placed, held[None])[0]) < DOUBTFUL_LOSS * tried:
-                break
+            if estimate is not None:
+                held = self._at_keyframe(estimate)
+                if float(total_loss(placed, held[None])[0]) < DOUBTFUL_LOSS * tried:
+                    break
+                # A search takes long: blocked ranges alone are no reason for one.
+                if not (self._is_young(estimate.stamp_ns) or too_short(placed, held) > MOST_TOO_SHORT):
+                    continue
             found, flaw = self._search(placed)
             note = note or flaw
             if found is None:
                 continue
-            if (
-                estimate is None
-                or held is None
-                or (
-                    _is_better(found, placed, held, estimate.planar_cov)
-                    and (self._is_young(estimate.stamp_ns) or too_short(placed, held) > MOST_TOO_SHORT)
-                )
-            ):
+            if estimate is None or _is_better(found, placed, held, estimate.planar_cov):
                 self._set(found)
                 return ""
         if estimate is not None:
             return ""
-        return f"looking for the pose: {note or 'waiting for LiDAR increments and ranges'}"
+        return note or "waiting for increments and ranges"
 
     def _at_keyframe(self, estimate: PoseEstimate) -> FloatArray:
         """Where the filter must have been at the newest keyframe, (3,)."""
@@ -167,7 +164,7 @@ class Recovering:
             return None, "drive a metre"
         found = find_pose(placed, self._config.bias_sigma)
         if found is None:
-            return None, "ranges to two anchors at least are needed"
+            return None, "ranges to two anchors are needed"
         if float(np.rad2deg(np.sqrt(found.cov[2, 2]))) > self._config.max_sigma_yaw_deg:
             return None, "drive a metre"
         if (
@@ -175,9 +172,9 @@ class Recovering:
             or found.least_agreeing < LEAST_AGREEING
             or found.mean_square > MOST_MEAN_SQUARE
         ):
-            return None, f"ranges contradict each other, {found.agreeing:.0%} agree"
+            return None, f"ranges contradict, {found.agreeing:.0%} agree"
         if not _is_clearly_less(found.loss, found.rival):
-            return None, "ranges fit two places, drive a curve"
+            return None, "two places fit, drive a curve"
         if float(np.sqrt(np.linalg.eigvalsh(found.cov[:2, :2])[1])) > MOST_SIGMA_XY:
             return None, "position is not sure enough yet"
         return found, ""

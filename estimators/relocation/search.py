@@ -11,8 +11,8 @@ from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
+from estimators import chi2
 from estimators.geometry import wrap_angles
 from estimators.messages import FloatArray
 from estimators.relocation.window import PlacedRanges

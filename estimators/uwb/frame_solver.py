@@ -25,25 +25,42 @@ class TagFix:
     Attributes:
         stamp_ns: of the frame.
         position: (3,) [m], map frame; the height is the site's where it was not solved for.
-        cov: (3, 3) [m^2]; the variance of the height is infinite when it was asked for but cannot be seen.
+        cov: (3, 3) [m^2], of ranges as good as stated; the variance of the height is infinite when it was
+            asked for but cannot be seen.
         iterations: steps of the solver.
+        dimensions: 3 where the height was solved for, else 2.
+        disagreement: variance of the ranges about the position over the stated one; at least 1, and 1 where
+            no range is to spare.
     """
 
     stamp_ns: int
     position: FloatArray
     cov: FloatArray
     iterations: int
+    dimensions: int
+    disagreement: float
+
+    @property
+    def widened_cov(self) -> FloatArray:
+        """`cov`, (3, 3) [m^2], with what was solved for as unsure as the ranges disagree."""
+        cov = self.cov.copy()
+        cov[: self.dimensions, : self.dimensions] *= self.disagreement
+        return cov
 
 
 class FrameSolver(ABC):
     """Position of every range frame; which solver finds it is the subclass's.
+
+    Where ranges disagree by more than their noise, something blocks one of them, and the pose is as unsure as
+    they disagree: its covariance grows by the variance of the residuals over the stated one.
 
     It knows no heading, so the body is taken to be below or above the tag and the lever arm enters the
     covariance. In space the height is solved for when the anchors do not lie in one plane. When they do, it
     is unobservable: the position is solved in the plane at the site's height, and the variance of the height
     is infinite.
 
-    Source: li2022 Eq. (1)-(2), positions in the plane from 3 anchors, in space from 4.
+    Source: li2022 Eq. (1)-(2), positions in the plane from 3 anchors, in space from 4; growth of the
+    covariance: a-posteriori variance factor of least squares.
     """
 
     class Config(BaseModel):
@@ -110,7 +127,7 @@ class FrameSolver(ABC):
             return None
         growth = (self._config.speed_sigma * age) ** 2
         cov = self._setup.lift_covariance(np.diag([0.0, 0.0, np.inf]))
-        cov[:3, :3] = fix.cov + np.diag([growth + self._lever_variance] * 2 + [growth])
+        cov[:3, :3] = fix.widened_cov + np.diag([growth + self._lever_variance] * 2 + [growth])
         T_map_body = lift(np.array([*fix.position[:2], 0.0]), fix.position[2] - self._setup.tag_in_body[2])
         return PoseEstimate(stamp_ns, T_map_body, cov, 0)
 
@@ -189,4 +206,7 @@ class FrameSolver(ABC):
         cov[: len(start), : len(start)] = gain @ gain.T
         if len(start) == 2:
             cov[2, 2] = np.inf if self._config.dimensions == 3 else self._setup.height_sigma**2
-        return TagFix(stamp_ns, position, cov, solution.iterations)
+        spare = len(ranges) - len(start)
+        off = (np.linalg.norm(anchors - solution.position, axis=1) - ranges) / sigmas
+        disagreement = max(1.0, float(off @ off) / spare) if spare else 1.0
+        return TagFix(stamp_ns, position, cov, solution.iterations, len(start), disagreement)

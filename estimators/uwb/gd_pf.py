@@ -1,5 +1,7 @@
 """Particle filter on solved positions: what momentum gradient descent finds, smoothed by a motion model."""
 
+from dataclasses import replace
+
 import numpy as np
 from pydantic import Field
 
@@ -106,13 +108,13 @@ class GdPf:
         position[: len(mean)], cov[: len(mean), : len(mean)] = mean, spread
         if np.isinf(solved.cov[2, 2]):
             cov[2, 2] = np.inf
-        self._fix = TagFix(solved.stamp_ns, position, cov, solved.iterations)
+        self._fix = replace(solved, position=position, cov=cov)
         self._resample()
 
     def _scatter(self, solved: TagFix) -> None:
         """Start anew about a position, with any walking speed."""
         count, dimensions = self._config.particles, self._config.dimensions
-        cov = solved.cov[:dimensions, :dimensions]
+        cov = solved.widened_cov[:dimensions, :dimensions]
         cov = np.where(np.isfinite(cov), cov, self._setup.height_sigma**2)
         noise = self._rng.standard_normal((2, count, dimensions))
         self._positions = solved.position[:dimensions] + noise[0] @ np.linalg.cholesky(cov).T
@@ -133,9 +135,10 @@ class GdPf:
         self._velocities = self._velocities + gained
 
     def _weigh(self, solved: TagFix) -> None:
-        known = np.isfinite(np.diag(solved.cov))[: self._config.dimensions].sum()
+        known = solved.dimensions
         off = self._positions[:, :known] - solved.position[:known]
-        squares = np.einsum("ni,ij,nj->n", off, np.linalg.inv(solved.cov[:known, :known]), off)
+        information = np.linalg.inv(solved.widened_cov[:known, :known])
+        squares = np.einsum("ni,ij,nj->n", off, information, off)
         tails = (TAIL_FREEDOM + known) / 2.0 * np.log1p(squares / TAIL_FREEDOM)
         log_weights = np.log(self._weights) - tails
         weights = np.exp(log_weights - log_weights.max())

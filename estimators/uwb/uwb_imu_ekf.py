@@ -143,7 +143,7 @@ class UwbImuEkf:
         return PoseEstimate(stamp_ns, T_map_body, self._setup.lift_covariance(planar), self._reset_counter)
 
     def _scale(self, fix: TagFix) -> float:  # noqa: ARG002
-        """Factor of the covariance of an observed position."""
+        """Factor of the covariance of an observed position; constant noise here, as in the paper."""
         return 1.0
 
     def _update_ranges(self, frame: RangeFrame) -> Report:
@@ -164,7 +164,7 @@ class UwbImuEkf:
     def _place(self, fix: TagFix) -> None:
         self._filter.x[MOVING] = [*fix.position[:2], 0.0, 0.0, 0.0, 0.0]
         self._filter.P[MOVING, :] = self._filter.P[:, MOVING] = 0.0
-        self._filter.P[:2, :2] = fix.cov[:2, :2]
+        self._filter.P[:2, :2] = fix.widened_cov[:2, :2]
         self._filter.P[2:6, 2:6] = np.diag([SPEED_SIGMA**2] * 2 + [ACCEL_SIGMA**2] * 2)
         self._is_placed = True
         self._reset_counter += 1
@@ -225,10 +225,11 @@ class UwbImuAdaptiveEkf(UwbImuEkf):
     The covariance of an observed position grows with the square of what exceeds either limit, so its gain,
     and even its pull, fades: where it is further from the predicted position than states and observations may
     be apart; where it is further from the position observed before than the robot can have come, three
-    standard deviations of both allowed for.
+    standard deviations of both allowed for. It grows, too, where the ranges disagree: what blocks a range
+    stays for a while, so the positions of that while err alike and count as one.
 
     Source: li2022, adaptive function on the gain, from state-observation distance and from the top speed; its
-    formulas are lost, the factors are ours.
+    formulas are lost, the factors are ours, and so is that of the disagreement.
     """
 
     class Config(UwbImuEkf.Config):
@@ -238,6 +239,9 @@ class UwbImuAdaptiveEkf(UwbImuEkf):
             0.25, gt=0, le=100, description="state and observed position are at most so far apart [m]"
         )
         top_speed: float = Field(1.0, gt=0, le=50, description="of the robot [m/s]")
+        blocked_time: float = Field(
+            2.0, gt=0, le=60, description="positions of ranges that disagree err alike for so long [s]"
+        )
 
     def __init__(self, config: Config, setup: Setup) -> None:
         self._limits = config
@@ -258,8 +262,11 @@ class UwbImuAdaptiveEkf(UwbImuEkf):
         apart = float(np.linalg.norm(fix.position[:2] - self._filter.x[:2]))
         step = float(np.linalg.norm(fix.position[:2] - before.position[:2]))
         variance = float(np.trace(fix.cov[:2, :2] + before.cov[:2, :2])) / 2.0
-        reach = self._limits.top_speed * (fix.stamp_ns - before.stamp_ns) * 1e-9 + 3.0 * np.sqrt(variance)
-        return float(max(1.0, apart / self._limits.max_distance) ** 2 * max(1.0, step / reach) ** 2)
+        dt = (fix.stamp_ns - before.stamp_ns) * 1e-9
+        reach = self._limits.top_speed * dt + 3.0 * np.sqrt(variance)
+        too_far = max(1.0, apart / self._limits.max_distance) * max(1.0, step / reach)
+        alike = self._limits.blocked_time / min(max(dt, 1e-3), self._limits.blocked_time)
+        return float(too_far**2 * (1.0 + (fix.disagreement - 1.0) * alike))
 
 
 def _heading(R_level_body: FloatArray) -> float:

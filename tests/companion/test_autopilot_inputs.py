@@ -1,20 +1,18 @@
-"""Wheels beside UWB, and UWB alone: sites without a LiDAR, replayed as they were recorded."""
+"""Wheels beside UWB, with a LiDAR and without, and UWB alone, replayed as they were recorded."""
 
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-import pytest
 from pymavlink.dialects.v20 import all as mavlink2
 
-from companion.config import load_config
-from companion.errors import UserError
+from companion.evaluate import Accuracy
 from companion.log import Direction, Log, LogWriter, RawChunk, Truth
 from companion.mavlink.link import NAME
 from companion.mavlink.session import MavlinkSession
 from companion.pipeline import Chain, make_pipeline
-from companion.replay import config_of, replay, tum_line
+from companion.replay import Replay, config_of, replay, tum_line
 from companion.sim.scenario import Scenario, load_scenario
 from companion.sim.simulate import START_NS, converse
 from estimators.geometry import between
@@ -117,6 +115,40 @@ def test_uwb_alone_sends_a_position_without_heading_when_the_site_says_so(tmp_pa
     assert len(found) < 60
 
 
-def test_a_lidar_and_wheels_at_once_are_refused() -> None:
-    with pytest.raises(UserError, match="cannot be chained"):
-        load_config(SITE, ["mavlink.inputs.wheels=20"])
+def with_lidar(folder: Path, more: str) -> Scenario:
+    """The short walk of a robot with tag, LiDAR and wheels."""
+    site = SITE.read_text(encoding="utf-8")
+    inputs = f"[mavlink.inputs]\nwheels = 25.0\nwheel_track = {TRACK}\n"
+    (folder / "site.toml").write_text(f"{site}\n{inputs}", encoding="utf-8")
+    path = folder / "walk.toml"
+    path.write_text(f'site = "{folder / "site.toml"}"\n{SHORT_WALK}{COLUMN}{more}', encoding="utf-8")
+    return load_scenario(path, 3, [])
+
+
+def accuracy_of(scenario: Scenario, path: Path) -> tuple[Replay, Accuracy]:
+    record(scenario, path)
+    result = replay(Log(path), config_of(Log(path), []), ["ekf"])
+    accuracy = result.accuracy("ekf")
+    assert accuracy is not None
+    return result, accuracy
+
+
+def test_wheels_beside_a_lidar_count_once_and_disturb_nothing(tmp_path: Path) -> None:
+    result, accuracy = accuracy_of(with_lidar(tmp_path, ""), tmp_path / "raw.mcap")
+    assert accuracy.rmse < 0.05
+    assert accuracy.nees < 6.0
+    assert result.verdicts["ekf"]["no reference"] == 0
+    assert result.verdicts["ekf"]["late"] == 0
+    # One increment a scan: those of the wheels reach the filter within them.
+    assert result.update_times["scan_matcher"].calls > 80
+
+
+def test_wheels_go_on_when_the_lidar_is_pulled(tmp_path: Path) -> None:
+    pulled = '[[faults]]\nsensor = "lidar"\nkind = "silence"\nat = 3.0\nduration = 6.0\n'
+    result, accuracy = accuracy_of(with_lidar(tmp_path, pulled), tmp_path / "raw.mcap")
+    assert accuracy.rmse < 0.12
+    assert accuracy.yaw_rmse_deg is not None
+    assert accuracy.yaw_rmse_deg < 6.0
+    # Without them it would be degraded for want of increments after a second.
+    assert result.health["degraded"] < 30
+    assert result.health["lost"] < 5

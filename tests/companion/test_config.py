@@ -7,6 +7,9 @@ import pytest
 
 from companion.config import Config, config_from_toml, default_toml, load_config, params_dir
 from companion.errors import UserError
+from companion.pipeline import make_scan_odometry
+from estimators.lidar.ekf_slam import EkfSlam
+from estimators.lidar.scan_matching import ScanMatcher
 from tests.conftest import SITE
 
 SITE_TEXT = SITE.read_text(encoding="utf-8")
@@ -38,6 +41,11 @@ def test_every_shipped_site_loads() -> None:
         load_config(site)
 
 
+def mavlink(lines: str) -> tuple[str, str]:
+    """A change of the site file: settings of `[mavlink]`."""
+    return "[start]", f"[mavlink]\n{lines}\n[start]"
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [
@@ -65,6 +73,20 @@ def test_every_shipped_site_loads() -> None:
             ("[start]", "[relocation]\nenabled = false\n[start]\nknown = false"),
             "relocation: enabled must be true",
         ),
+        (mavlink("speed = true\nmessage = 'odometry'"), "mavlink: odometry carries the velocity already"),
+        (mavlink("speed = true\nprofile = 'px4'"), "mavlink: PX4 reads no VISION_SPEED_ESTIMATE"),
+        (mavlink("forward = true"), "mavlink: forward needs a second link"),
+        (
+            mavlink("url = 'udpin:0.0.0.0:14550'\nground_url = 'udpin:0.0.0.0:14550'"),
+            "mavlink: url and ground_url are the same link, 'udpin:0.0.0.0:14550'",
+        ),
+        (mavlink("autopilot_id = 255"), "mavlink: autopilot_id 255 is one of ground_ids"),
+        (mavlink("ground_ids = [0]"), "mavlink.ground_ids.0: Input should be greater than or equal to 1"),
+        (mavlink("raw_ranges = true"), "mavlink: raw_ranges give anchors by latitude and longitude"),
+        (
+            mavlink("inputs = {wheels = 10}"),
+            "mavlink: increments of a LiDAR and of the autopilot's link cannot be chained",
+        ),
     ],
 )
 def test_a_wrong_site_file_is_refused_in_one_line(change: tuple[str, str], said: str) -> None:
@@ -74,6 +96,13 @@ def test_a_wrong_site_file_is_refused_in_one_line(change: tuple[str, str], said:
     assert said in str(caught.value)
     assert str(caught.value).startswith("site.toml")
     assert "\n" not in str(caught.value)
+
+
+def test_obstacles_need_a_lidar() -> None:
+    assert load_config(SITE, ["mavlink.obstacles=true"]).mavlink.obstacles
+    without = SITE_TEXT[: SITE_TEXT.index("[sensor.lidar]")]
+    with pytest.raises(UserError, match="mavlink: obstacles come from a LiDAR"):
+        config_from_toml(without, "site.toml", ["mavlink.obstacles=true"])
 
 
 def test_a_start_that_is_unknown_needs_no_pose() -> None:
@@ -117,3 +146,12 @@ def test_radians_and_metres_reach_the_estimators(config: Config) -> None:
     assert setup.anchors[2].tolist() == raw["anchors"]["2"]
     assert setup.start.sigma[2] == pytest.approx(raw["start"]["sigma_yaw_deg"] * 3.14159265 / 180)
     assert setup.height_to(setup.anchors[0]) == pytest.approx(2.2 - 0.30 - 0.20)
+
+
+def test_the_front_end_is_chosen_by_name_with_its_own_table(config: Config) -> None:
+    assert isinstance(make_scan_odometry(config), ScanMatcher)
+    text = config.to_toml()
+    chosen = config_from_toml(text, "x", ["pipeline.front_end=ekf_slam", "ekf_slam.max_features=7"])
+    assert isinstance(make_scan_odometry(chosen), EkfSlam)
+    with pytest.raises(UserError, match="unknown front end 'icp', there are: ekf_slam, scan_matcher"):
+        config_from_toml(text, "x", ["pipeline.front_end=icp"])

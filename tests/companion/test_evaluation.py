@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from companion.config import params_dir
+from companion.config import load_config, params_dir
 from companion.errors import UserError
 from companion.evaluation import Evaluation, evaluate_scenario
 from companion.evaluation_table import evaluation_notes
@@ -19,7 +19,7 @@ from companion.log import Log
 from companion.replay import config_of, replay
 from companion.sim.scenario import load_scenario
 from companion.trial import TrialFigures, run_trial
-from tests.conftest import SITE, write_log, write_scenario
+from tests.conftest import SITE, Command, write_log, write_scenario
 
 STRAIGHT_ON = "[trajectory]\nwaypoints = [[1.5, 1.2], [3.5, 1.2]]\nlaps = 0\nrest = 1.0\n"
 FEW = "[increments]\nrate = 10\n[uwb]\nrate = 10\n"
@@ -181,6 +181,21 @@ def test_without_blocked_ranges_least_squares_reaches_the_bound_of_its_frames(tm
 
 
 @pytest.mark.parametrize(
+    ("heights", "told"),
+    [((2.0, 2.0, 2.0, 2.0), "height unobservable"), ((0.2, 2.6, 0.3, 2.6), "height from ranges at 9")],
+)
+def test_what_ranges_tell_of_the_height_is_told(
+    tmp_path: Path, heights: tuple[float, ...], told: str
+) -> None:
+    places = load_config(SITE).anchors.items()
+    sets = [f"anchors.{i}=[{x},{y},{z}]" for (i, (x, y, _)), z in zip(places, heights, strict=True)]
+    path = write_scenario(tmp_path, STRAIGHT_ON, FEW)
+    result = evaluate_scenario(path, 1, choices=["momentum_gd:3", "momentum_gd:2"], sets=sets)
+    (note,) = [line for line in evaluation_notes(result) if "height" in line]
+    assert note.startswith(f"momentum_gd:3: {told}")
+
+
+@pytest.mark.parametrize(
     "more",
     [
         "[increments]\nrate = 10\n[uwb]\nrate = 25\n",
@@ -323,9 +338,9 @@ def test_the_command_prints_our_figures_and_the_papers(tmp_path: Path) -> None:
     assert "…" not in done.stdout
 
 
-def test_options_may_come_first(tmp_path: Path) -> None:
+def test_options_may_come_first(tmp_path: Path, command: Command) -> None:
     path = write_scenario(tmp_path, STRAIGHT_ON, FEW)
-    done = companion("--trials", "1", "--workers", "1", "--estimators", "lidar", path, cwd=tmp_path)
+    done = command("evaluate", "--trials", "1", "--workers", "1", "--estimators", "lidar", path)
     assert done.returncode == 0, done.stderr
     assert "scenario: means of 1 trials" in done.stdout
 
@@ -337,22 +352,19 @@ def test_options_may_come_first(tmp_path: Path) -> None:
         (["FILE", "--json", "gone/out.json"], "cannot write gone/out.json: there is no folder gone"),
     ],
 )
-def test_bad_input_gives_one_line_and_exit_code_2(tmp_path: Path, arguments: list[str], said: str) -> None:
+def test_bad_input_gives_one_line_and_exit_code_2(
+    tmp_path: Path, command: Command, arguments: list[str], said: str
+) -> None:
     path = write_scenario(tmp_path, STRAIGHT_ON, FEW)
-    done = companion(*(str(path) if word == "FILE" else word for word in arguments), cwd=tmp_path)
+    done = command("evaluate", *(str(path) if word == "FILE" else word for word in arguments))
     assert done.returncode == 2
     assert done.stdout == ""
     assert said in done.stderr
     assert done.stderr.count("\n") == 1
 
 
-def test_a_scenario_without_bytes_is_refused_where_bytes_are_needed(tmp_path: Path) -> None:
-    path = write_scenario(tmp_path, STRAIGHT_ON, FEW)
-    arguments = [sys.executable, "-m", "companion", "simulate", str(path), "--out", "x"]
-    environment = {**os.environ, "PYTHONPATH": os.getcwd()}
-    done = subprocess.run(
-        arguments, cwd=tmp_path, env=environment, text=True, capture_output=True, timeout=100, check=False
-    )
+def test_a_scenario_without_bytes_is_refused_where_bytes_are_needed(tmp_path: Path, command: Command) -> None:
+    done = command("simulate", write_scenario(tmp_path, STRAIGHT_ON, FEW), "--out", "x")
     assert done.returncode == 2
     assert "a scenario with [increments] has no bytes" in done.stderr
     assert not (tmp_path / "x").exists()

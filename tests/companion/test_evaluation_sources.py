@@ -18,7 +18,7 @@ from companion.replay import config_of, replay
 from companion.trial_runner import run_trials
 from companion.worst_trial import write_worst_trial
 from tests.companion.test_evaluation import FEW, PAPER, STRAIGHT_ON, companion, without_times
-from tests.conftest import SITE, write_scenario
+from tests.conftest import SITE, Command, write_scenario
 
 CHOICES = ["uwb_ls", "ekf"]
 
@@ -218,7 +218,7 @@ def test_the_command_takes_several_sources_and_writes_one_report(
     assert "…" not in done.stdout
 
 
-def test_a_site_that_is_no_scenario_is_refused(tmp_path: Path) -> None:
-    done = companion(SITE, "--trials", "1", cwd=tmp_path)
+def test_a_site_that_is_no_scenario_is_refused(command: Command) -> None:
+    done = command("evaluate", SITE, "--trials", "1")
     assert done.returncode == 2
     assert done.stderr.count("\n") == 1

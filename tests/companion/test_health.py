@@ -81,7 +81,9 @@ def test_a_heading_that_nobody_needs_may_be_unknown() -> None:
         monitor = HealthMonitor(HealthTable.model_validate({}), True, False, needs_heading=needs_heading)
         for stamp_ns in range(0, 5 * SECOND, SECOND // 10):
             monitor.observe(ranges(stamp_ns), Report((Verdict.ACCEPTED,) * 4))
-        assert monitor.judge(pose(cov), 5 * SECOND).state is expected
+        health = monitor.judge(pose(cov), 5 * SECOND)
+        assert health.state is expected
+        assert health.reason.endswith("set mavlink.heading = false") is needs_heading
 
 
 def test_a_sensor_that_never_speaks_is_degraded_after_a_while() -> None:
@@ -185,12 +187,13 @@ def test_what_an_estimator_lacks_is_told_to_the_operator() -> None:
     lost = np.eye(6) * 0.01
     lost[5, 5] = np.inf
     assert monitor.judge(pose(lost), 5 * SECOND).reason.endswith("start again on the start mark")
-    monitor.observe(ranges(5 * SECOND), Report((Verdict.WAITING,) * 4, note="looking for the pose: drive"))
-    assert monitor.judge(None, 5 * SECOND).reason == "looking for the pose: drive"
+    monitor.observe(ranges(5 * SECOND), Report((Verdict.WAITING,) * 4, note="drive a metre"))
+    looking = monitor.judge(None, 5 * SECOND)
+    assert (looking.reason, looking.brief) == ("looking for the pose: drive a metre", "drive a metre")
     health = monitor.judge(pose(lost), 5 * SECOND)
     assert (health.state, health.reason) == (
         State.LOST,
-        "heading not known: looking for the pose: drive",
+        "heading not known: drive a metre",
     )
     monitor.observe(ranges(5 * SECOND), Report((Verdict.ACCEPTED,) * 4))
     assert monitor.judge(None, 5 * SECOND).reason == "no pose yet: waiting for measurements"
@@ -220,10 +223,9 @@ def test_what_is_too_long_speaks_against_the_pose_and_what_only_stands_in_the_wa
 
 def test_the_operator_hears_which_anchors_are_used_and_why_the_others_are_not() -> None:
     monitor = HealthMonitor(HealthTable.model_validate({}), True, True, anchor_ids=[0, 1, 2, 3, 7])
-    assert (
-        uwb_line(monitor.anchors(0))
-        == "UWB: 0 of 5 anchors, A0 silent, A1 silent, A2 silent, A3 silent, A7 silent"
-    )
+    assert uwb_line(monitor.anchors(0)) == "UWB: 0 of 5 anchors, A0 A1 A2 A3 A7 silent"
+    assert uwb_line(monitor.anchors(0), longest=35) == "UWB 0/5: A0 A1 A2 A3 A7 silent"
+    assert uwb_line(monitor.anchors(0), longest=25) == "UWB 0/5: 5 silent"
     good, bad = Verdict.ACCEPTED, Verdict.WEAK_FIRST_PATH
     monitor.observe(ranges(SECOND), Report((good, Verdict.DOWNWEIGHTED, good, Verdict.IMPOSSIBLE)))
     monitor.observe(ranges(2 * SECOND), Report((good, Verdict.DOWNWEIGHTED, bad, Verdict.GATED)))
@@ -239,7 +241,7 @@ def test_an_estimator_without_use_for_ranges_leaves_the_anchors_silent() -> None
     monitor = HealthMonitor(HealthTable.model_validate({}), True, True, anchor_ids=[0, 1])
     frame = RangeFrame(SECOND, 1, np.arange(2), np.ones(2), np.ones(2), np.ones(2))
     monitor.observe(frame, Report((Verdict.NOT_USED,) * 2))
-    assert uwb_line(monitor.anchors(SECOND)) == "UWB: 0 of 2 anchors, A0 silent, A1 silent"
+    assert uwb_line(monitor.anchors(SECOND)) == "UWB: 0 of 2 anchors, A0 A1 silent"
 
 
 def test_after_a_reset_ranges_must_confirm_the_pose_before_it_is_sent_again() -> None:

@@ -37,8 +37,8 @@ from drivers.linktrack_types import (
 from drivers.rplidar import Rplidar
 from estimators.geometry import transform, wrap_angle
 from estimators.messages import Attitude, FloatArray, ImuSample, Measurement, RangeFrame, Scan
-from tests.companion.test_evaluation import FEW, companion
-from tests.conftest import write_scenario
+from tests.companion.test_evaluation import FEW
+from tests.conftest import Command, write_scenario
 
 Record = RawChunk | Truth
 AT, END = 4.0, 7.0
@@ -370,8 +370,8 @@ def test_a_scenario_without_bytes_takes_no_fault(tmp_path: Path) -> None:
         evaluate_scenario(write_scenario(tmp_path, more=FEW), 1, choices=["ekf"], faults=["spike"])
 
 
-def test_the_command_says_what_is_wrong_in_one_line(short_log: Path, tmp_path: Path) -> None:
-    done = companion(short_log, "--fault", "drop:anchor=77", cwd=tmp_path)
+def test_the_command_says_what_is_wrong_in_one_line(short_log: Path, command: Command) -> None:
+    done = command("evaluate", short_log, "--fault", "drop:anchor=77")
     assert done.returncode == 2
     assert "--fault drop:anchor=77: anchor=77: the site has no such anchor" in done.stderr
     assert done.stderr.count("\n") == 1

@@ -36,7 +36,8 @@ def errors_of(poses: FloatArray, truth: FloatArray, sigma: float = 0.1) -> Error
     error = poses - truth
     error[:, 2] = wrap_angles(error[:, 2])
     stamps = 10_000_000 * np.arange(1, len(poses) + 1, dtype=np.int64)
-    return Errors(stamps, poses, truth, error, np.tile(sigma**2 * np.eye(3), (len(poses), 1, 1)), 1.0)
+    cov = np.tile(sigma**2 * np.eye(3), (len(poses), 1, 1))
+    return Errors(stamps, poses, truth, error, cov, np.zeros(len(poses)), np.ones(len(poses)), 1.0)
 
 
 def evo_track(poses: FloatArray) -> PoseTrajectory3D:

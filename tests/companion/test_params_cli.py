@@ -27,6 +27,12 @@ FLOAT, INTEGER = mavlink2.MAV_PARAM_TYPE_REAL32, mavlink2.MAV_PARAM_TYPE_INT32
 USES = ("uwb_lidar", "uwb_position", "rover", "gps_and_uwb")
 
 
+@pytest.fixture(autouse=True)
+def soon_asked_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An autopilot on this machine answers sooner than one behind a radio."""
+    monkeypatch.setattr("companion.autopilot_client.ANSWER_TIME", 0.2)
+
+
 def as_float(number: int) -> float:
     """How PX4 sends an integer."""
     return float(struct.unpack("<f", struct.pack("<i", number))[0])

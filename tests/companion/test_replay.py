@@ -1,6 +1,7 @@
 """Replay of simulated logs: the figures that the demo shows, and that a replay repeats itself."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -12,12 +13,12 @@ from evo.tools import file_interface
 from companion.config import Config
 from companion.errors import UserError
 from companion.log import Direction, Log, LogWriter, RawChunk, Truth
+from companion.pipeline import Chain, Tick, make_pipeline
 from companion.replay import Replay, config_of, replay, write_outputs
 from companion.sim.scenario import load_scenario
-from estimators import ESTIMATORS
 from tests.conftest import SCENARIO, write_log
 
-ALL = list(ESTIMATORS)
+SENSORS_AND_FUSED = ["ekf", "least_squares", "lidar_odometry"]
 SEEDS = (1, 2, 3)
 
 
@@ -29,7 +30,7 @@ def run(path: Path, names: list[str], sets: list[str] | None = None) -> Replay:
 @pytest.fixture(scope="module", params=SEEDS)
 def room(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Replay:
     path = tmp_path_factory.mktemp("room") / "room.mcap"
-    return run(write_log(load_scenario(SCENARIO, request.param, []), path), ALL)
+    return run(write_log(load_scenario(SCENARIO, request.param, []), path), SENSORS_AND_FUSED)
 
 
 def test_fused_is_within_a_decimetre_and_not_worse_than_either_sensor(room: Replay) -> None:
@@ -60,13 +61,43 @@ def test_all_bytes_are_understood_and_none_comes_late(room: Replay) -> None:
 
 
 def test_the_same_log_twice_gives_the_same_bytes(short_log: Path, tmp_path: Path) -> None:
+    # That each estimator repeats itself is a test of its own; here it is the chain round them.
+    names = ["ekf", "pf_ibas_graph", "least_squares"]
     for folder in ("a", "b"):
-        write_outputs(run(short_log, ALL), tmp_path / folder)
+        write_outputs(run(short_log, names), tmp_path / folder)
     files = sorted(path.name for path in (tmp_path / "a").glob("*.tum"))
-    assert files == sorted(["poses.tum", *(f"poses_{name}.tum" for name in ALL if name != "ekf")])
+    assert files == ["poses.tum", "poses_least_squares.tum", "poses_pf_ibas_graph.tum"]
     for name in [*files, "config.toml"]:
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
     assert len((tmp_path / "a" / "poses.tum").read_text().splitlines()) > 300
+
+
+def test_bytes_that_a_busy_machine_takes_late_are_replayed_as_late(short_log: Path) -> None:
+    log = Log(short_log)
+    config = config_of(log, [])
+
+    def chain() -> Chain:
+        return Chain(config, log.start_ns, make_pipeline(config, ["ekf"]), "ekf")
+
+    def told(ticks: Iterable[Tick]) -> list[tuple[int, bytes]]:
+        poses = [(tick.stamp_ns, tick.poses["ekf"]) for tick in ticks]
+        return [(stamp_ns, pose.T_map_body.tobytes()) for stamp_ns, pose in poses if pose is not None]
+
+    rng = np.random.default_rng(1)
+    live, logged, lived = chain(), [], []
+    arrived = [chunk for chunk in log if isinstance(chunk, RawChunk)]
+    for chunk in (c for c in arrived if c.stamp_ns < log.start_ns + 5_000_000_000):
+        if rng.random() < 0.05:
+            # The loop's turn comes late, and once more before these bytes are handed over.
+            lived += told(live.advance(chunk.stamp_ns + 80_000_000))
+            logged.append(RawChunk("mavlink", Direction.OUT, chunk.stamp_ns + 160_000_000, b""))
+        logged.append(replace(chunk, stamp_ns=live.stamp_to_log(chunk.stamp_ns)))
+        lived += told(live.feed(logged[-1]))
+    again = chain()
+    replayed = [pose for chunk in logged for pose in told(again.feed(chunk))]
+    assert len(lived) > 100
+    assert replayed == lived[: len(replayed)]
+    assert len(lived) - len(replayed) < 4
 
 
 def test_other_estimators_beside_it_change_nothing(short_log: Path, tmp_path: Path) -> None:

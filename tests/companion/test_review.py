@@ -4,7 +4,7 @@ from pathlib import Path
 
 from rerun.chunk import RrdReader
 
-from tests.command_line import companion
+from tests.conftest import Command
 
 
 def entities(path: Path) -> dict[str, list[float]]:
@@ -16,10 +16,12 @@ def entities(path: Path) -> dict[str, list[float]]:
     return found
 
 
-def test_review_draws_the_named_part_with_estimators_side_by_side(short_log: Path, tmp_path: Path) -> None:
+def test_review_draws_the_named_part_with_estimators_side_by_side(
+    command: Command, short_log: Path, tmp_path: Path
+) -> None:
     names = "ekf,lidar_odometry"
     part = ("--from", "4", "--to", "7", "--save", "part.rrd")
-    done = companion("review", short_log, "--estimator", names, *part, cwd=tmp_path)
+    done = command("review", short_log, "--estimator", names, *part)
     assert done.returncode == 0, done.stderr
     assert "worst error" in done.stdout
     found = entities(tmp_path / "part.rrd")
@@ -29,10 +31,10 @@ def test_review_draws_the_named_part_with_estimators_side_by_side(short_log: Pat
         assert 6.9 < max(seconds) <= 7.0
 
 
-def test_two_logs_stand_side_by_side(short_log: Path, tmp_path: Path) -> None:
+def test_two_logs_stand_side_by_side(command: Command, short_log: Path, tmp_path: Path) -> None:
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "raw.mcap").write_bytes(short_log.read_bytes())
-    done = companion("review", short_log, "run", "--to", "3", "--save", "both.rrd", cwd=tmp_path)
+    done = command("review", short_log, "run", "--to", "3", "--save", "both.rrd")
     assert done.returncode == 0, done.stderr
     found = entities(tmp_path / "both.rrd")
     for root in ("before", "after"):
@@ -50,10 +52,10 @@ BAD_CALLS = {
 }
 
 
-def test_bad_calls_are_one_line_and_exit_code_2(short_log: Path, tmp_path: Path) -> None:
+def test_bad_calls_are_one_line_and_exit_code_2(command: Command, short_log: Path, tmp_path: Path) -> None:
     for arguments, said in BAD_CALLS.values():
         words = [str(short_log) if word == "LOG" else word for word in arguments]
-        done = companion("review", *words, cwd=tmp_path)
+        done = command("review", *words)
         assert done.returncode == 2
         assert done.stderr.count("\n") == 1
         assert f"error: {said}" in done.stderr

@@ -24,7 +24,7 @@ from tests.companion.mavlink.scripted_autopilot import ScriptedAutopilot
 from tests.conftest import SCENARIO
 
 METRES_PER_DEGREE = 111_319.5
-SPEED = 0.4
+SPEED = 0.6
 
 
 class Sitl(ScriptedAutopilot):
@@ -105,7 +105,7 @@ def served(autopilot: ScriptedAutopilot) -> Iterator[str]:
 def test_a_vehicle_is_followed_wherever_it_stands(tmp_path: Path) -> None:
     sitl = Sitl()
     with served(sitl) as url:
-        arguments = ["sitl", "--connect", url, "--world", str(SCENARIO), "--seconds", "9"]
+        arguments = ["sitl", "--connect", url, "--world", str(SCENARIO), "--seconds", "6"]
         result = CliRunner().invoke(app, [*arguments, "--out", str(tmp_path / "run")])
     assert result.exit_code == 0, result.output
     assert sitl.driven > 0.5

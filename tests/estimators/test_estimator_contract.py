@@ -11,6 +11,7 @@ from estimators import ESTIMATORS, estimator_config_class, make_estimator
 from estimators.base import Estimator, Report, Verdict
 from estimators.messages import (
     Attitude,
+    FloatArray,
     ImuSample,
     LandmarkFrame,
     Measurement,
@@ -26,6 +27,8 @@ EVERY_ESTIMATOR = pytest.mark.parametrize("name", sorted(ESTIMATORS))
 LONG = settings(deadline=None, max_examples=50)
 
 SECOND_NS = 10**9
+LONGEST_NOTE = 35
+"""Characters that a text to the pilot has room for."""
 SMALL_COV = np.diag([1e-4, 1e-4, 1e-5])
 
 
@@ -88,6 +91,7 @@ def assert_report_fits(report: Report, measurement: Measurement) -> None:
     assert len(report.verdicts) == expected
     assert len(report.residuals) in {0, expected}
     assert len(report.nis) in {0, expected}
+    assert len(report.note) <= LONGEST_NOTE
 
 
 def assert_pose_is_sound(pose: PoseEstimate, stamp_ns: int) -> None:
@@ -101,7 +105,15 @@ def assert_pose_is_sound(pose: PoseEstimate, stamp_ns: int) -> None:
     known = np.isfinite(np.diag(pose.cov))
     # What is not known is so on the diagonal alone, and positively.
     assert (np.diag(pose.cov)[~known] > 0.0).all()
-    cov = pose.cov[np.ix_(known, known)]
+    assert_is_covariance(pose.cov[np.ix_(known, known)])
+    assert (pose.velocity is None) == (pose.velocity_cov is None)
+    if pose.velocity is not None and pose.velocity_cov is not None:
+        assert np.isfinite(pose.velocity).all()
+        assert_is_covariance(pose.velocity_cov)
+
+
+def assert_is_covariance(cov: FloatArray) -> None:
+    """Symmetric and semidefinite."""
     values = np.linalg.eigvalsh(cov)
     np.testing.assert_allclose(cov, cov.T, atol=1e-12 * values[-1])
     assert values[0] >= -1e-9 * values[-1]
@@ -173,6 +185,31 @@ def test_honest_stream_gives_the_true_pose(name: str) -> None:
     # An estimator without heading is off by the lever arm at most, one of few particles by millimetres more.
     distance = float(np.linalg.norm(pose.xy - SETUP.start.pose[:2]))
     assert distance <= float(np.linalg.norm(SETUP.tag_in_body[:2])) + 0.01
+
+
+# What only sees single fixes has no velocity.
+@pytest.mark.parametrize("name", sorted(ESTIMATORS.keys() - {"least_squares"}))
+def test_the_velocity_is_that_of_the_pose(name: str) -> None:
+    estimator = started(name)
+    moved = np.array([0.04, 0.02, 0.01])
+    for k in range(1, 6):
+        stamp_ns = 2 * SECOND_NS + k * SECOND_NS // 10
+        estimator.update(PoseIncrement(2 * SECOND_NS, stamp_ns, k * moved, SMALL_COV, is_keyframe=False))
+    stamp_ns = round(2.6 * SECOND_NS)
+    pose, later = estimator.pose_at(stamp_ns), estimator.pose_at(stamp_ns + SECOND_NS // 100)
+    assert pose is not None
+    assert later is not None
+    assert pose.velocity is not None
+    assert pose.velocity_cov is not None
+    by_poses = (later.T_map_body - pose.T_map_body)[:3, 3] / 0.01
+    np.testing.assert_allclose(pose.velocity, by_poses, atol=1e-9)
+    # It has followed the increments, of which each leads 4.5 cm further in a tenth of a second.
+    assert np.hypot(*pose.velocity[:2]) == pytest.approx(0.45, rel=0.25)
+    assert_is_covariance(pose.velocity_cov)
+    # White acceleration of density 0.5 m/s^2/sqrt(Hz) makes it less certain with time, the height apart.
+    assert later.velocity_cov is not None
+    grown = np.diag([0.25 * 0.01, 0.25 * 0.01, 0.0])
+    np.testing.assert_allclose(later.velocity_cov - pose.velocity_cov, grown, atol=1e-9)
 
 
 @EVERY_ESTIMATOR

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from tools.bench import decoders, growth, processes, rows
-from tools.bench.__main__ import BASELINE, BENCHMARKS
+from tools.bench.__main__ import BASELINE, BENCHMARKS, WHOLE_ROWS
 from tools.bench.peers import PacketParser
 from tools.bench.rows import TOLERANCE, Benchmark, Row, measure, shortfalls
 
@@ -88,8 +88,21 @@ def test_rows_that_the_baseline_does_not_name_are_not_compared() -> None:
 def test_the_baseline_names_rows_that_there_are() -> None:
     baseline = json.loads(BASELINE.read_text(encoding="utf-8"))
     assert baseline
-    assert {entry["name"] for entry in baseline} <= set(BENCHMARKS)
+    assert {entry["name"] for entry in baseline} <= {*BENCHMARKS, *WHOLE_ROWS}
     assert all(entry["ratio"] > 0 and entry["better"] in ("higher", "lower") for entry in baseline)
+
+
+def test_the_rows_that_others_read_are_there_and_in_the_baseline() -> None:
+    stable = {
+        *("linktrack_decode", "rplidar_express_decode", "rplidar_standard_decode", "scan_match"),
+        *(f"pf_ibas_40_vs_pf_{n}_{what}" for n in (200, 1000) for what in ("time", "rmse")),
+        *("smoother_batch_1000", "smoother_batch_10000"),
+        *("smoother_fixed_lag_200_vs_batch", "smoother_fixed_lag_200_vs_incremental"),
+        *("replay_real_time_factor", "live_cpu_share", "startup_help_s"),
+    }
+    baseline = json.loads(BASELINE.read_text(encoding="utf-8"))
+    assert stable <= {*BENCHMARKS, *WHOLE_ROWS}
+    assert stable - {entry["name"] for entry in baseline} == {"linktrack_decode"}
 
 
 @pytest.mark.parametrize("name", decoders.BENCHMARKS)

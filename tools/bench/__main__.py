@@ -17,11 +17,20 @@ import typer
 from rich.console import Console
 from rich.progress import Progress
 
-from tools.bench import chain, decoders, growth, matching, processes, smoother
+from tools.bench import chain, decoders, growth, matching, particles, processes, smoother
 from tools.bench.decoders import DisagreementError
 from tools.bench.rows import ROUNDS, TOLERANCE, Row, measure, shortfalls, table
 
-BENCHMARKS = {**decoders.BENCHMARKS, **matching.BENCHMARKS, **chain.BENCHMARKS, **smoother.BENCHMARKS}
+BENCHMARKS = {
+    **decoders.BENCHMARKS,
+    **particles.BENCHMARKS,
+    **matching.BENCHMARKS,
+    **smoother.BENCHMARKS,
+    **chain.BENCHMARKS,
+}
+"""Rows that `measure` makes."""
+WHOLE_ROWS = {**particles.ROWS, **processes.ROWS}
+"""Rows that come as they are."""
 BASELINE = Path(__file__).with_name("baseline.json")
 
 
@@ -40,7 +49,7 @@ def main(
         title = f"Python {platform.python_version()}, {datetime.date.today()}; CPU time"
         Console().print(growth.curves_table([curve() for curve in growth.CURVES], title))
         return
-    known = [*BENCHMARKS, *processes.ROWS]
+    known = [*BENCHMARKS, *WHOLE_ROWS]
     names = only.split(",") if only else known
     for name in names:
         if name not in known:
@@ -69,7 +78,7 @@ def _measured(names: list[str]) -> list[Row]:
         task = progress.add_task("", total=len(names))
         for name in names:
             progress.update(task, description=name)
-            whole = processes.ROWS.get(name)
+            whole = WHOLE_ROWS.get(name)
             rows.append(whole() if whole else measure(name, BENCHMARKS[name]()))
             progress.advance(task)
     return rows

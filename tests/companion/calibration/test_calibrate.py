@@ -13,6 +13,8 @@ from companion.calibration.recording import Recording, read_recording
 from companion.config import Config, load_config
 from companion.errors import UserError
 from companion.log import Log, RawChunk, Truth
+from companion.log_edit.edit import edit_log
+from companion.log_edit.faults import parse_fault
 from companion.pipeline import Chain, make_pipeline
 from companion.sim.scenario import load_scenario
 from estimators.messages import RangeFrame
@@ -110,6 +112,28 @@ def test_the_site_file_keeps_its_comments_and_takes_the_biases(log: Path, tmp_pa
     invoke("ranges", str(log), *options, "--until", "5")
     assert site.read_text(encoding="utf-8").count("common_sigma") == 1
     assert load_config(site).range_bias.common != stored.range_bias.common
+
+
+def test_a_hidden_anchor_lets_nothing_be_written_that_was_found_against_the_lidar(
+    log: Path, tmp_path: Path
+) -> None:
+    opened, site = Log(log), tmp_path / "site.toml"
+    config = load_config(SITE)
+    blocked = [parse_fault("nlos:anchor=1,at=3,for=9,least=0.4,mean=0.6", config)]
+    edit_log(opened, config, blocked, 1, tmp_path / "hidden.mcap")
+    site.write_text(SITE.read_text(encoding="utf-8"), encoding="utf-8")
+    options = ["--site", str(site), "--until", "14", "--picture", str(tmp_path / "p.png")]
+    result = CliRunner().invoke(app, ["ranges", str(tmp_path / "hidden.mcap"), *options])
+    assert result.exit_code == 1
+    assert "anchor 1: its errors scatter too much" in result.output
+    assert "nothing written" in result.output
+    assert site.read_text(encoding="utf-8") == SITE.read_text(encoding="utf-8")
+    # Known positions do not depend on any anchor: there the others' biases are as good as ever.
+    against_truth = CliRunner().invoke(
+        app, ["ranges", str(tmp_path / "hidden.mcap"), "--against", "truth", *options]
+    )
+    assert against_truth.exit_code == 0
+    assert load_config(site).range_biases()[2].constant == pytest.approx(0.0, abs=0.03)
 
 
 def test_surveyed_points_tell_the_biases_too(log: Path, recording: Recording, tmp_path: Path) -> None:

@@ -27,27 +27,39 @@ def at_zero(bias: RangeBias) -> float:
 
 def test_bias_and_growth_are_found_as_well_as_claimed() -> None:
     squares = []
-    for seed in range(60):
-        fit = fit_anchor(drive(np.random.default_rng(seed), 0.15, 0.02))
-        true = 0.15 + 0.02 * fit.bias.distance
-        squares += [
-            ((fit.bias.constant - true) / fit.constant_sigma) ** 2,
-            ((fit.bias.per_metre - 0.02) / fit.per_metre_sigma) ** 2,
-        ]
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        found = fit_biases({i: drive(rng, 0.15 + 0.1 * i, 0.02) for i in range(3)})
+        fits = list(found.anchors.values())
+        squares.append(((fits[0].bias.per_metre - 0.02) / fits[0].per_metre_sigma) ** 2)
+        for i, fit in enumerate(fits):
+            true = 0.15 + 0.1 * i + 0.02 * fit.bias.distance
+            squares.append(((fit.bias.constant - true) / fit.constant_sigma) ** 2)
+        assert len({fit.bias.per_metre for fit in fits}) == 1
     # The clustered covariance of sixty blocks is known to some tenths itself.
-    low, high = chi2.ppf(1e-4, 120) / 120, 1.15 * chi2.ppf(1 - 1e-4, 120) / 120
+    low, high = chi2.ppf(1e-4, 160) / 160, 1.15 * chi2.ppf(1 - 1e-4, 160) / 160
     assert low < np.mean(squares) < high
 
 
 def test_growth_that_noise_could_have_made_is_not_taken() -> None:
-    fits = [fit_anchor(drive(np.random.default_rng(seed), 0.1, 0.0)) for seed in range(40)]
-    assert sum(fit.bias.per_metre != 0.0 for fit in fits) <= 3
+    grown = 0
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        found = fit_biases({i: drive(rng, 0.1, 0.0) for i in range(2)})
+        grown += any(fit.bias.per_metre != 0.0 for fit in found.anchors.values())
+    assert grown <= 3
+
+
+def test_what_one_anchor_alone_shows_of_growth_is_not_laid_on_it() -> None:
+    rng = np.random.default_rng(3)
+    found = fit_biases({0: drive(rng, 0.1, 0.03), 1: drive(rng, 0.1, -0.03)})
+    assert [fit.bias.per_metre for fit in found.anchors.values()] == [0.0, 0.0]
 
 
 def test_no_growth_is_looked_for_at_one_distance() -> None:
     rng = np.random.default_rng(0)
     stay = Ranges(np.arange(100) / 10.0, 5.2 + 0.05 * rng.standard_normal(100), np.full(100, 5.0))
-    fit = fit_anchor(stay)
+    fit = fit_biases({0: stay}).anchors[0]
     assert (fit.bias.per_metre, fit.per_metre_sigma) == (0.0, 0.0)
     assert fit.bias.constant == pytest.approx(0.2, abs=0.03)
 
@@ -61,9 +73,14 @@ def test_blocked_ranges_are_left_out() -> None:
 
 
 def test_corrected_ranges_have_no_bias_left() -> None:
-    fit = fit_anchor(drive(np.random.default_rng(1), 0.2, 0.03))
+    fit = fit_biases({0: drive(np.random.default_rng(1), 0.2, 0.03)}).anchors[0]
     assert np.median(fit.residuals(calibrated=False)) > 0.25
     assert abs(np.median(fit.residuals(calibrated=True))) < 0.02
+
+
+def test_the_spread_about_the_line_is_that_of_the_noise_alone() -> None:
+    fit = fit_biases({0: drive(np.random.default_rng(1), 0.2, 0.1)}).anchors[0]
+    assert fit.spread == pytest.approx(0.08, abs=0.01)
 
 
 def test_the_common_bias_is_the_mean_and_more_certain_than_any() -> None:

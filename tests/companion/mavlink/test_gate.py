@@ -185,20 +185,6 @@ def test_figures_that_change_are_no_news() -> None:
     assert len(told) == 1
 
 
-@pytest.mark.parametrize("length", [30, 36, 37, 80, 86, 87, 136, 400])
-def test_long_texts_are_put_together_again_by_their_chunks(length: int) -> None:
-    reason = "x" * length
-    chunks = Announcer().poll(Health(State.LOST, reason), Decision(False, 0), 0)
-    whole = "pose lost: " + reason
-    # What a ground station does: gather until a chunk is not full.
-    assert "".join(m.text.decode() if isinstance(m.text, bytes) else m.text for m in chunks) == whole[:150]
-    if len(chunks) > 1:
-        assert [m.chunk_seq for m in chunks] == list(range(len(chunks)))
-        assert {m.id for m in chunks} != {0}
-        assert len(chunks[-1].text) < 50
-        assert all(len(m.text) == 50 for m in chunks[:-1])
-
-
 def test_a_pose_that_comes_late_is_left_out_and_does_not_stop_the_stream() -> None:
     flight = Flight(site())
     flight.fly(3.0)

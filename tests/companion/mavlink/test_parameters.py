@@ -11,7 +11,7 @@ import pytest
 from pymavlink import mavparm, mavutil
 from pymavlink.dialects.v20 import all as mavlink2
 
-from companion.config import Config, load_config
+from companion.config import Config, config_from_toml, load_config
 from companion.errors import UserError
 from companion.mavlink.link import NAME
 from companion.mavlink.parameters import (
@@ -28,6 +28,14 @@ from tests.companion.mavlink.scripted_autopilot import SYSTEM
 from tests.conftest import SITE
 
 US = (SYSTEM, 197)
+
+
+def no_change(*_: object) -> None:
+    """Told of a parameter that was set."""
+
+
+def no_alignment() -> None:
+    """Told to align."""
 
 
 class Pilot:
@@ -118,6 +126,10 @@ def test_a_write_is_answered_with_the_new_value_and_used() -> None:
         ("OUT_HEIGHT", 0.5, 0.0),
         ("OUT_HEIGHT", 2.0, 0.0),
         ("TAG_X", 20_000.0, -0.1),
+        ("NLOS_EXCESS", 0.0, 0.5),
+        ("NLOS_MEMORY", 61.0, 2.0),
+        ("NLOS_POWER", -1.0, 8.0),
+        ("NLOS_OBST_HGT", 101.0, 2.0),
     ],
 )
 def test_a_bad_write_is_answered_with_the_old_value(name: str, bad: float, old: float | None) -> None:
@@ -152,6 +164,31 @@ def test_what_would_change_poses_counts_from_the_next_start_on() -> None:
     assert not any(parameter.applies_at_once for parameter, _ in changes)
 
 
+def test_thresholds_of_blocked_ranges_are_those_of_the_estimator_that_runs() -> None:
+    for chosen in ("pf", "graph"):
+        pilot = Pilot(pipeline__estimator=chosen)
+        for name, value in (("NLOS_EXCESS", 0.8), ("NLOS_POWER", 6.5), ("NLOS_OBST_HGT", 1.2)):
+            assert pilot.set(name, value) == pytest.approx(value)
+        assert [setting_line(*change) for change in pilot.flight.session.take_changes()] == [
+            f"estimator.{chosen}.nlos_excess=0.8",
+            f"estimator.{chosen}.nlos_power=6.5",
+            f"estimator.{chosen}.obstacle_height=1.2",
+        ]
+    without = mavlink2.MAVLink_param_request_read_message(*US, b"NLOS_EXCESS", -1)
+    assert Pilot(pipeline__estimator="lidar_odometry").ask(without) == []
+
+
+def test_a_start_without_coordinates_has_no_parameters_for_them() -> None:
+    text = SITE.read_text(encoding="utf-8")
+    for line in ("x = 1.5", "y = 1.2", "yaw_deg = 0.0"):
+        text = text.replace(f"{line}\n", "")
+    server = ParameterServer(config_from_toml(text, "site", ["start.known=false"]), no_change, no_alignment)
+    server.receive(mavlink2.MAVLink_param_request_list_message(*US))
+    listed = [str(m.param_id) for m in server.poll(1e6, 1.0)]
+    assert len(listed) == len(server) > 30
+    assert not any("START" in name for name in listed)
+
+
 def test_what_waits_for_the_next_start_does_not_slip_in_with_what_counts_at_once() -> None:
     pilot = Pilot()
     pilot.set("OUT_HEADING", 0.0)
@@ -165,7 +202,7 @@ def test_what_waits_for_the_next_start_does_not_slip_in_with_what_counts_at_once
 def test_every_parameter_is_a_setting_that_set_takes() -> None:
     config = load_config(SITE)
     lines: list[str] = []
-    server = ParameterServer(config, lambda p, c: lines.append(setting_line(p, c)), lambda: None)
+    server = ParameterServer(config, lambda p, c: lines.append(setting_line(p, c)), no_alignment)
     names = []
     for index in range(len(server)):
         (answer,) = server.receive(mavlink2.MAVLink_param_request_read_message(*US, b"", index))

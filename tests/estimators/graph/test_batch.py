@@ -1,6 +1,7 @@
 """Whole recordings: smoother than any filter, anchors and biases found, blocked ranges left out."""
 
 import csv
+from collections.abc import Callable
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
@@ -10,9 +11,12 @@ import pytest
 
 from estimators.base import Setup, Start
 from estimators.geometry import between
+from estimators.graph import factors
 from estimators.graph.batch import Smoothed, smooth
 from estimators.graph.errors import GraphError
+from estimators.graph.losses import GAUSSIAN
 from estimators.graph.recording import Noise, Recording
+from estimators.graph.solver import solve
 from estimators.messages import FloatArray, IntArray, LandmarkFrame, Measurement, PoseIncrement, RangeFrame
 from tests.estimators.matched_world import HALL, pose_error, true_ranges
 from tests.strategies import range_frame
@@ -91,23 +95,76 @@ def test_every_pose_gets_better_by_what_comes_after_it() -> None:
     assert all(fix.bias_sigma == 0.0 and not fix.position_cov.any() for fix in found.anchors.values())
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_a_drive_surveys_anchors_and_biases(seed: int) -> None:
-    # All over the hall, past the anchors: from its middle alone a bias looks like a distance.
+def heading_along(x: FloatArray, y: FloatArray) -> FloatArray:
+    """Poses (N, 3) of a robot that looks where it goes."""
+    return np.column_stack([x, y, np.unwrap(np.arctan2(np.gradient(y), np.gradient(x)))])
+
+
+def all_over_the_hall() -> FloatArray:
     angles = np.linspace(0.0, 2.0 * np.pi, 1500)
-    x, y = 7.0 * np.sin(2.0 * angles), 6.5 * np.sin(3.0 * angles)
-    truth = np.column_stack([x, y, np.unwrap(np.arctan2(np.gradient(y), np.gradient(x)))])
-    biases = {10: 0.15, 11: 0.3, 12: 0.2, 13: 0.1}
+    return heading_along(7.0 * np.sin(2.0 * angles), 6.5 * np.sin(3.0 * angles))
+
+
+def round_each_anchor(radius: float = 1.0, share: float = 1.0) -> FloatArray:
+    """Poses (1500, 3): straight from anchor to anchor, and round each, or this share of it from within."""
+    inward = np.arctan2(-places(HALL)[:, 1], -places(HALL)[:, 0])
+    angles = inward[:, None] + share * np.pi * np.linspace(-1.0, 1.0, 9)
+    circles = radius * np.stack([np.cos(angles), np.sin(angles)], axis=2)
+    way = (places(HALL)[:, None] + circles).reshape(-1, 2)
+    lengths = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(way, axis=0), axis=1))])
+    at = np.linspace(0.0, lengths[-1], 1500)
+    window = np.hanning(11) / np.hanning(11).sum()
+    padded = (np.pad(np.interp(at, lengths, column), 5, mode="edge") for column in way.T)
+    return heading_along(*(np.convolve(column, window, "valid") for column in padded))
+
+
+BIASES = {10: 0.15, 11: 0.3, 12: 0.2, 13: 0.1}
+
+
+def survey(truth: FloatArray, seed: int) -> Smoothed:
+    """What a drive tells of anchors whose places were known to half a metre."""
     setup = replace(displaced(HALL, 0.5, seed), start=replace(HALL.start, pose=truth[0]))
-    recording = Recording(drive(truth, seed, biases), setup, NOISE, {})
-    found = smooth(recording, lambda _: at_truth(truth, 0.1), find_anchors=True, find_biases=True)
+    recording = Recording(drive(truth, seed, BIASES), setup, NOISE, {})
+    guess = at_truth(truth, 0.1)
+    return smooth(recording, lambda _: guess, find_anchors=True, find_biases=True)
+
+
+def bias_sigmas(truth: FloatArray) -> FloatArray:
+    """Cramer-Rao bounds of the biases that a drive tells [m]: the inverse information at the truth."""
+    setup = replace(HALL, start=replace(HALL.start, pose=truth[0]))
+    recording = Recording(drive(truth, 0), setup, NOISE, {})
+    graph = recording.graph(truth, find_anchors=True, find_biases=True)
+    graph.ranges[:, factors.RANGE_LOSS] = GAUSSIAN.kind
+    sigmas: FloatArray = np.sqrt(solve(graph).covariances(graph.free)[: len(HALL.anchors), 2, 2])
+    return sigmas
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(
+    ("course", "most_bias"), [(all_over_the_hall, np.inf), (round_each_anchor, 0.03)], ids=["hall", "round"]
+)
+def test_a_drive_surveys_anchors_and_biases(
+    course: Callable[[], FloatArray], most_bias: float, seed: int
+) -> None:
+    found = survey(course(), seed)
     errors = np.linalg.norm(aligned(found_places(found), places(HALL)) - places(HALL), axis=1)
     assert errors.max() < 0.05
     for anchor_id, fix in found.anchors.items():
-        # The drive tells a bias to some 4 cm, and says so.
-        assert abs(fix.bias - biases[anchor_id]) < 3.0 * fix.bias_sigma < 0.15
+        off = abs(fix.bias - BIASES[anchor_id])
+        assert off < most_bias
+        assert off < 3.0 * fix.bias_sigma < 0.15
         assert fix.residual_rms == pytest.approx(0.1, abs=0.01)
         assert fix.ranges + fix.blocked == 1500
+
+
+def test_who_sees_an_anchor_from_both_sides_tells_its_bias_from_its_distance() -> None:
+    # What moves an anchor along the line of sight a bias does as well, but not for who sees it from behind.
+    one_side, inner_half, round_it = map(
+        bias_sigmas, [all_over_the_hall(), round_each_anchor(share=0.5), round_each_anchor()]
+    )
+    assert 0.04 < one_side.max() < 0.05
+    assert 0.012 < inner_half.max() < 0.016
+    assert 0.007 < round_it.max() < 0.01
 
 
 def test_blocked_ranges_are_left_out() -> None:

@@ -92,6 +92,7 @@ def scan_while_moving(
     rng: np.random.Generator | None = None,
     range_sigma: float = 0.0,
     lidar_in_body: FloatArray | None = None,
+    period: float = PERIOD,
 ) -> Scan:
     """One revolution, each beam from where the lidar is at its own instant.
 
@@ -102,10 +103,11 @@ def scan_while_moving(
         rng: source of range noise.
         range_sigma: its standard deviation [m].
         lidar_in_body: (3,) mounting; at the body origin without it.
+        period: of the revolution [s].
     """
     mounting = np.zeros(3) if lidar_in_body is None else lidar_in_body
     angles = 2 * np.pi * np.arange(BEAMS) / BEAMS
-    times = PERIOD * np.arange(BEAMS) / BEAMS
+    times = period * np.arange(BEAMS) / BEAMS
     body = path.poses(start + times)
     c, s = np.cos(body[:, 2]), np.sin(body[:, 2])
     origins = body[:, :2] + np.column_stack(

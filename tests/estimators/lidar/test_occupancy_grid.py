@@ -69,6 +69,15 @@ def test_a_box_blocks_the_lines_behind_it_and_no_others() -> None:
     assert not grid.blocked(beside, POSE[:2])
 
 
+def test_a_grid_far_from_the_origin_blocks_the_same_lines() -> None:
+    grid, far_off = OccupancyGrid(CONFIG), np.array([30.0, -55.0, 0.0])
+    for _ in range(3):
+        assert grid.insert(POSE + far_off, seen_from(POSE))
+    behind, beside = np.array([35.8, -51.0]), np.array([35.5, -54.0])
+    assert grid.blocked((POSE + far_off)[:2], behind)
+    assert not grid.blocked((POSE + far_off)[:2], beside)
+
+
 def test_one_glimpse_is_no_obstacle() -> None:
     assert not room_grid(scans=1).obstacles.any()
 

@@ -113,14 +113,15 @@ def to_nearest_wall(points: FloatArray) -> FloatArray:
     return distance
 
 
-def test_the_tag_is_where_its_lever_arm_puts_it() -> None:
-    # The tag, not the body's origin, stands behind the corner of the box.
-    arm = Setup(SETUP.anchors, np.array([0.0, 0.8, 0.2]), SETUP.start, HEIGHT, 0.05, 0.05)
-    visibility = Visibility(2.0, arm)
+@pytest.mark.parametrize("yaw", [0.0, 1.2, -2.0])
+def test_the_tag_is_where_its_lever_arm_puts_it(yaw: float) -> None:
+    # The tag, not the body's origin, stands behind the corner of the box, whichever way the body faces.
+    arm = np.array([0.8 * np.sin(yaw), 0.8 * np.cos(yaw), 0.2])
+    visibility = Visibility(2.0, Setup(SETUP.anchors, arm, SETUP.start, HEIGHT, 0.05, 0.05))
     visibility.grid = ROOM_SEEN.grid
-    pose = np.array([3.0, 2.2, 0.0])
+    pose = np.array([3.0, 2.2, yaw])
     anchor = np.array([5.9, 2.6, 2.5])
-    tag = compose(pose, np.array([0.0, 0.8, 0.0]))[:2]
+    tag = compose(pose, np.array([*arm[:2], 0.0]))[:2]
     assert ROOM_SEEN.grid.blocked(tag, anchor[:2])
     assert visibility.log_ratio(pose, anchor) == OBSTRUCTED
     assert ROOM_SEEN.log_ratio(pose, anchor) == 0.0

@@ -75,8 +75,8 @@ def test_while_the_start_is_unknown_there_is_no_pose_but_a_reason() -> None:
     reports = feed(estimator, robot.walk(10.0, speed=0.0))
     assert estimator.pose_at(robot.now_ns) is None
     assert {verdict for report in reports for verdict in report.verdicts} == {Verdict.WAITING}
-    assert reports[0].note == "looking for the pose: waiting for LiDAR increments and ranges"
-    assert reports[-1].note == "looking for the pose: drive a metre"
+    assert reports[0].note == "waiting for increments and ranges"
+    assert reports[-1].note == "drive a metre"
     found = [report.note for report in feed(estimator, robot.walk(5.0))]
     assert found[-1] == ""
     assert is_right(estimator, robot)
@@ -100,7 +100,7 @@ def test_anchors_nearly_in_line_are_no_ground_for_a_guess() -> None:
     robot.pose = np.array([2.0, 3.0, 0.3])
     reports = feed(estimator, robot.walk(6.0, bends=False))
     assert estimator.pose_at(robot.now_ns) is None
-    assert reports[-1].note == "looking for the pose: ranges fit two places, drive a curve"
+    assert reports[-1].note == "two places fit, drive a curve"
 
 
 @pytest.mark.parametrize("name", FILTERS)
@@ -168,9 +168,10 @@ def test_a_wrong_start_mark_is_found_out_and_put_right(placement: FloatArray) ->
     assert is_right(estimator, robot)
 
 
-def test_a_heading_that_a_gap_in_the_scans_lost_is_found_again() -> None:
+@pytest.mark.parametrize("name", ["ekf", "graph"])
+def test_a_heading_that_a_gap_in_the_scans_lost_is_found_again(name: str) -> None:
     robot = Robot(ROOM, 4)
-    estimator = recovering("ekf", known_start(ROOM, robot.pose))
+    estimator = recovering(name, known_start(ROOM, robot.pose))
     feed(estimator, robot.walk(4.0))
     for measurement in robot.walk(4.0):
         if len(getattr(measurement, "ranges", [])):
@@ -180,10 +181,12 @@ def test_a_heading_that_a_gap_in_the_scans_lost_is_found_again() -> None:
     lost = estimator.pose_at(robot.now_ns)
     assert lost is not None
     assert lost.cov[5, 5] == np.inf
-    assert reports[-1].note.startswith("looking for the pose:")
+    assert reports[-1].note
     feed(estimator, robot.walk(5.0))
     assert is_right(estimator, robot)
-    assert reset_counter(estimator, robot) == 1
+    counted = reset_counter(estimator, robot)
+    # The graph counts besides what its own pose jumps by.
+    assert counted == 1 or (name == "graph" and counted > 1)
 
 
 def test_one_of_three_anchors_blocked_for_good_leads_to_no_wrong_guess() -> None:

@@ -96,6 +96,26 @@ def test_covariance_is_that_of_the_errors(name: str, dimensions: int) -> None:
     assert low < sum(squares) < high
 
 
+@SOLVERS
+@pytest.mark.parametrize("dimensions", [2, 3])
+def test_a_pose_is_as_unsure_as_its_ranges_disagree(name: str, dimensions: int) -> None:
+    fifth = np.array([4.0, 6.5, 1.5])
+    setup = replace(HIGH_AND_LOW, anchors={**HIGH_AND_LOW.anchors, 5: fifth})
+    found = solver(name, setup, dimensions=dimensions)
+    tag = np.array([3.0, 2.0, SETUP.height + 0.3])
+    agreeing = slants(setup, tag)
+    variances = []
+    for k, excess in enumerate((0.0, 1.0)):
+        found.update(range_frame(k, list(setup.anchors), [agreeing[0] + excess, *agreeing[1:]]))
+        pose = found.pose_at(k)
+        assert pose is not None
+        variances.append(np.diag(pose.cov)[:3])
+    growth = variances[1] / variances[0]
+    # Of the site's height nothing was measured.
+    assert (growth[:dimensions] > 3.0).all()
+    assert dimensions == 3 or growth[2] == 1.0
+
+
 def test_linear_least_squares_suffers_more_from_blocked_ranges() -> None:
     rng = np.random.default_rng(0)
     worse = {}

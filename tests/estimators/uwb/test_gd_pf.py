@@ -63,3 +63,18 @@ def test_some_light_particles_survive_with_little_weight() -> None:
     assert weights.sum() == 1.0 or abs(weights.sum() - 1.0) < 1e-12
     assert weights.min() < 0.1 * weights.max()
     assert len(np.unique(pf._positions, axis=0)) > 100
+
+
+def test_positions_of_ranges_that_disagree_leave_the_particles_less_sure() -> None:
+    claims = []
+    for excess in (0.0, 0.6):
+        pf = GdPf(GdPf.Config(particles=500), NO_ARM)
+        tag = np.array([3.0, 2.0, NO_ARM.height + NO_ARM.tag_in_body[2]])
+        agreeing = np.array(slants(NO_ARM, tag))
+        for k in range(30):
+            blocked = agreeing + excess * (k >= 20) * np.array([1.0, 0.0, 0.0, 0.0])
+            pf.update(range_frame(k * SECOND_NS // 10, list(NO_ARM.anchors), blocked.tolist()))
+        assert pf.fix is not None
+        claims.append(float(np.sqrt(np.trace(pf.fix.cov[:2, :2]))))
+    # Ten such frames leave the particles less sure than ten that agree.
+    assert claims[1] > 1.5 * claims[0]

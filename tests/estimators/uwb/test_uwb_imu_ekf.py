@@ -9,7 +9,15 @@ from scipy.stats import chi2
 
 from estimators.base import Setup, Start, Verdict
 from estimators.geometry import rotation, wrap_angle
-from estimators.messages import Attitude, FloatArray, ImuSample, Measurement, PoseEstimate, RangeFrame
+from estimators.messages import (
+    Attitude,
+    FloatArray,
+    ImuSample,
+    Measurement,
+    PoseEstimate,
+    RangeFrame,
+    measurement_stamp_ns,
+)
 from estimators.models.inertial import GRAVITY
 from estimators.uwb.uwb_imu_ekf import UwbImuAdaptiveEkf, UwbImuEkf
 from tests.strategies import SETUP, range_frame
@@ -88,6 +96,16 @@ def followed(
     return np.array(errors), np.array(covs), poses
 
 
+def jumping(measurement: Measurement, circle: Circle, burst: tuple[float, float]) -> Measurement:
+    """The measurement; ranges of the burst are those of a tag 0.7 m beside the true one."""
+    t = measurement_stamp_ns(measurement) * 1e-9
+    if not isinstance(measurement, RangeFrame) or not burst[0] <= t < burst[1]:
+        return measurement
+    tag = np.array([*(circle.tag(t) + 0.5), ROOM.height + ROOM.tag_in_body[2]])
+    slants = [float(np.linalg.norm(anchor - tag)) for anchor in ROOM.anchors.values()]
+    return range_frame(measurement.stamp_ns, list(ROOM.anchors), slants)
+
+
 def plain(setup: Setup = ROOM, **settings: float | str) -> UwbImuEkf:
     return UwbImuEkf(UwbImuEkf.Config.model_validate(settings), setup)
 
@@ -157,9 +175,9 @@ def test_without_bursts_the_adaptive_filter_is_as_good() -> None:
     ("limit", "burst"), [({"top_speed": 50.0}, (6.0, 6.8)), ({"max_distance": 100.0}, (6.0, 6.05))]
 )
 def test_either_limit_alone_lessens_the_gain(limit: dict[str, float], burst: tuple[float, float]) -> None:
-    # A robot's speed tells of the first position of a burst alone, the distance of all.
-    circle = Circle(1)
-    stream = circle.stream(8.0, burst=burst)
+    # A robot's speed tells of the first position of a burst alone, the distance of all. The ranges agree.
+    circle = Circle(1, range_sigma=0.0)
+    stream = [jumping(measurement, circle, burst) for measurement in circle.stream(8.0)]
     worst = []
     for limits in ({"top_speed": 50.0, "max_distance": 100.0}, limit):
         errors, *_ = followed(adaptive(**limits), circle, stream)
@@ -167,6 +185,23 @@ def test_either_limit_alone_lessens_the_gain(limit: dict[str, float], burst: tup
     same, *_ = followed(plain(), circle, stream)
     assert worst[0] == pytest.approx(float(np.hypot(same[:, 0], same[:, 1])[50:].max()))
     assert worst[1] < 0.8 * worst[0]
+
+
+def test_ranges_that_disagree_lessen_the_gain_for_as_long_as_something_blocks_them() -> None:
+    off = {"top_speed": 50.0, "max_distance": 100.0}
+    nees: dict[float, list[float]] = {0.05: [], 2.0: []}
+    for seed in range(4):
+        for blocked_time, into in nees.items():
+            circle = Circle(seed)
+            estimator = adaptive(blocked_time=blocked_time, **off)
+            errors, covs, _ = followed(estimator, circle, circle.stream(7.0, burst=(4.0, 7.0)))
+            blocked = slice(40, 70, 5)
+            e, P = errors[blocked, :2], covs[blocked, :2, :2]
+            into += np.einsum("ni,nij,nj->n", e, np.linalg.inv(P), e).tolist()
+    # Instants of one burst err alike: each walk counts as one sample.
+    low, high = chi2.ppf(1e-3, 2 * 4) / 4, chi2.ppf(1 - 1e-3, 2 * 4) / 4
+    assert low < np.mean(nees[2.0]) < high
+    assert np.mean(nees[0.05]) > 1.5 * np.mean(nees[2.0])
 
 
 def test_particle_positions_can_be_observed_too() -> None:

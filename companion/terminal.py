@@ -1,0 +1,54 @@
+"""What the commands write with: results to stdout; progress and messages to stderr."""
+
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TaskProgressColumn,
+    TextColumn,
+    TimeRemainingColumn,
+)
+
+Seed = Annotated[
+    int | None, typer.Option("--seed", min=0, metavar="N", help="Instead of the scenario's own seed.")
+]
+Sets = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="KEY=VALUE",
+        help="Change one setting of the site, e.g. --set pipeline.rate=20. Repeatable.",
+    ),
+]
+
+
+def result_console() -> Console:
+    """Console for what a command was asked for."""
+    return Console(highlight=False, emoji=False)
+
+
+def message_console() -> Console:
+    """Console for everything else; its lines are not folded, so that scripts find them whole."""
+    return Console(stderr=True, highlight=False, emoji=False, soft_wrap=True)
+
+
+def progress(console: Console, *, counts: bool = False) -> Progress:
+    """Bars with the time left, on a terminal only.
+
+    Args:
+        console: of messages.
+        counts: say how many are done rather than the percentage.
+    """
+    return Progress(
+        TextColumn("{task.description:>9}"),
+        BarColumn(),
+        MofNCompleteColumn() if counts else TaskProgressColumn(),
+        TimeRemainingColumn(),
+        console=console,
+        transient=True,
+        disable=not console.is_terminal,
+    )

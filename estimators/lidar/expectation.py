@@ -1,0 +1,173 @@
+"""What is thought of a scan's motion before it is matched: constant velocity, or what else is known.
+
+With odometry from outside the states are those of its drift: seen from a body that moves as the odometry
+says, the robot stands still but for the odometry's error. With a gyroscope this holds of the heading alone.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from estimators.geometry import compose, rotation, transform_each
+from estimators.lidar.known_motion import GyroTrack, OdometryTrack
+from estimators.lidar.scan_preparation import PreparedScan
+from estimators.messages import FloatArray
+from estimators.models.motion import cubic_between, smooth_motion
+
+_LEAST_VARIANCE = 1e-8
+"""Of what odometry says [m^2, rad^2]."""
+_MODES = np.pi * np.arange(1, 7)
+"""Of a Brownian bridge, that are looked at; what is left out has a seventh of its variance."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Expectation:
+    """A scan and the states at its ends, before they are told by walls.
+
+    Attributes:
+        points: (N, 2) [m] of the beams, moved along the known motion to the end of the scan.
+        basis: (N, 4) weights of the two poses and velocities in what is left of each beam's pose.
+        state: (6,) pose and velocity at the end of the scan before, moved along the known motion.
+        cov: (6, 6) of it.
+        F: (6, 6) transition from there to the end of this scan.
+        Q: (6, 6) its noise.
+        twist: (3,) known velocity at the end, body frame; the states' comes on top of it.
+        drift: (3, 3) covariance of what the known motion errs by from end to end.
+    """
+
+    points: FloatArray
+    basis: FloatArray
+    state: FloatArray
+    cov: FloatArray
+    F: FloatArray
+    Q: FloatArray
+    twist: FloatArray
+    drift: FloatArray
+
+    def bent(self, shares: FloatArray, by_pose: FloatArray) -> FloatArray:
+        """Covariance (3, 3) that the pose at the end has because the known motion's own errors bend the scan.
+
+        The drift is a random walk and is taken for straight; from there it deviates as a Brownian bridge,
+        whose modes are sines. Each of them moves the beams, and by them the pose that fits best.
+
+        Args:
+            shares: (M,) of the way in time from the scan before, of the beams that are matched.
+            by_pose: (M, 3) change of each beam's distance from its line with the pose at its instant.
+        """
+        if not self.drift.any():
+            return self.drift
+        by_end = shares[:, None] * by_pose
+        hessian = by_end.T @ by_end + _LEAST_VARIANCE * np.eye(3)
+        cov = np.zeros((3, 3))
+        for mode in _MODES:
+            pull = by_end.T @ ((np.sqrt(2.0) / mode * np.sin(mode * shares))[:, None] * by_pose)
+            gain = np.linalg.solve(hessian, pull)
+            cov += gain @ self.drift @ gain.T
+        return cov
+
+
+@dataclass(frozen=True, slots=True)
+class MotionNoise:
+    """What unknown motion is taken for.
+
+    Attributes:
+        accel: density of white acceleration [m/s^2/sqrt(Hz)].
+        yaw_accel: of white angular acceleration [rad/s^2/sqrt(Hz)].
+        bandwidth: the fastest swaying [Hz].
+        gyro_sigma: standard deviation of a yaw rate that is measured [rad/s].
+    """
+
+    accel: float
+    yaw_accel: float
+    bandwidth: float
+    gyro_sigma: float
+
+
+def expect(
+    scan: PreparedScan,
+    since_ns: int,
+    state: FloatArray,
+    cov: FloatArray,
+    noise: MotionNoise,
+    odometry: OdometryTrack,
+    gyro: GyroTrack,
+) -> Expectation:
+    """What is thought of a scan.
+
+    Args:
+        scan: that is to be matched.
+        since_ns: end of the scan before.
+        state: (6,) pose and velocity then.
+        cov: (6, 6) of it.
+        noise: of what is not known of the motion.
+        odometry: used where it reaches from the scan before, or the first beam, to the end.
+        gyro: likewise, without odometry.
+    """
+    dt = (scan.stamp_ns - since_ns) * 1e-9
+    shares = 1.0 + scan.times / dt
+    first_ns = min(since_ns, scan.stamp_ns + round(float(scan.times[0]) * 1e9))
+    moved = odometry.motion(since_ns, scan.stamp_ns) if odometry.covers(first_ns, scan.stamp_ns) else None
+    if moved is not None:
+        return _along_odometry(scan, state, cov, dt, moved, odometry)
+    if gyro.covers(first_ns, scan.stamp_ns):
+        F, Q = smooth_motion(dt, noise.accel, noise.gyro_sigma, noise.bandwidth)
+        turn = -float(gyro.turns(scan.stamp_ns, np.array([-dt]))[0])
+        state, cov = state.copy(), cov.copy()
+        state[2] += turn
+        state[5], cov[5, :], cov[:, 5] = 0.0, 0.0, 0.0
+        cov[5, 5] = noise.gyro_sigma**2
+        beams = np.zeros((len(scan.times), 3))
+        beams[:, 2] = gyro.turns(scan.stamp_ns, scan.times)
+        twist = np.array([0.0, 0.0, gyro.rate()])
+        return Expectation(
+            transform_each(beams, scan.points),
+            cubic_between(shares, dt),
+            state,
+            cov,
+            F,
+            Q,
+            twist,
+            np.zeros((3, 3)),
+        )
+    F, Q = smooth_motion(dt, noise.accel, noise.yaw_accel, noise.bandwidth)
+    return Expectation(
+        scan.points, cubic_between(shares, dt), state, cov, F, Q, np.zeros(3), np.zeros((3, 3))
+    )
+
+
+def _along_odometry(
+    scan: PreparedScan,
+    state: FloatArray,
+    cov: FloatArray,
+    dt: float,
+    moved: tuple[FloatArray, FloatArray],
+    odometry: OdometryTrack,
+) -> Expectation:
+    """Its drift is a random walk, which between two poses goes straight on average."""
+    increment, increment_cov = moved
+    turn, lever = np.eye(3), np.eye(3)
+    turn[:2, :2] = rotation(state[2])
+    c, s = np.cos(state[2]), np.sin(state[2])
+    lever[0, 2] = -s * increment[0] - c * increment[1]
+    lever[1, 2] = c * increment[0] - s * increment[1]
+    drift = turn @ increment_cov @ turn.T + _LEAST_VARIANCE * np.eye(3)
+    yaw = state[2] + increment[2]
+    pose = compose(state[:3], increment)
+    pose[2] = yaw
+    moved_cov, Q = np.zeros((6, 6)), np.zeros((6, 6))
+    moved_cov[:3, :3] = lever @ cov[:3, :3] @ lever.T
+    moved_cov[3:, 3:] = Q[3:, 3:] = drift / dt**2
+    Q[:3, :3] = drift
+    F = np.diag([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
+    share = 1.0 + scan.times / dt
+    basis = np.column_stack([1.0 - share, np.zeros(len(share)), share, np.zeros(len(share))])
+    return Expectation(
+        transform_each(odometry.beams(scan.stamp_ns, scan.times), scan.points),
+        basis,
+        np.concatenate([pose, np.zeros(3)]),
+        moved_cov,
+        F,
+        Q,
+        odometry.twist(),
+        drift,
+    )
