@@ -92,7 +92,7 @@ def comparison_blueprint(runs: Sequence[Layout]) -> rrb.Blueprint:
     return _blueprint(rrb.Horizontal(*columns))
 
 
-def _blueprint(root: rrb.Container) -> rrb.Blueprint:
+def _blueprint(root: rrb.Container | rrb.View) -> rrb.Blueprint:
     return rrb.Blueprint(
         root,
         rrb.SelectionPanel(state="hidden"),
@@ -102,26 +102,40 @@ def _blueprint(root: rrb.Container) -> rrb.Blueprint:
     )
 
 
+def walk_blueprint(config: Config) -> rrb.Blueprint:
+    """The map alone, of a robot whose true walk is known."""
+    title = "truth, x right, y up: robot white, free lines of sight green, blocked vermilion"
+    return _blueprint(_map_view(config, "", title, ["truth"], LIVE_TRAIL))
+
+
 def _map(run: Layout, trail: float) -> rrb.Spatial2DView:
-    corners = [position[:2] for position in run.config.anchors.values()]
-    corners += [corner for wall in run.config.site.walls for corner in wall]
+    shown = [f"{run.primary} blue"]
+    shown += ["truth white"] if run.has_truth else []
+    shown += ["autopilot orange"] if run.has_autopilot else []
+    title = f"{_title(run)}map, x right, y up: {', '.join(shown)}"
+    return _map_view(run.config, run.root, title, [f"estimate/{name}" for name in run.names], trail)
+
+
+def _map_view(
+    config: Config, root: str, title: str, moving: Iterable[str], trail: float
+) -> rrb.Spatial2DView:
+    """The map below `root`, with a trail of so many seconds behind each entity that moves."""
+    corners = [position[:2] for position in config.anchors.values()]
+    corners += [corner for wall in config.site.walls for corner in wall]
     (left, bottom), (right, top) = np.min(corners, axis=0) - _MARGIN, np.max(corners, axis=0) + _MARGIN
     visible = rrb.VisibleTimeRanges(
         timeline=TIME,
         start=rrb.TimeRangeBoundary.cursor_relative(seconds=-trail),
         end=rrb.TimeRangeBoundary.cursor_relative(),
     )
-    shown = [f"{run.primary} blue"]
-    shown += ["truth white"] if run.has_truth else []
-    shown += ["autopilot orange"] if run.has_autopilot else []
     return rrb.Spatial2DView(
-        origin=run.root or "/",
-        contents=f"/{run.root}map/**",
-        name=f"{_title(run)}map, x right, y up: {', '.join(shown)}",
+        origin=root or "/",
+        contents=f"/{root}map/**",
+        name=title,
         background=GROUND,
         # Seen from outside the mirroring transform of `map`, y runs from -top to -bottom.
         visual_bounds=rrb.VisualBounds2D(x_range=[left, right], y_range=[-top, -bottom]),
-        overrides={f"/{run.root}map/estimate/{name}/trail": visible for name in run.names},
+        overrides={f"/{root}map/{name}/trail": visible for name in moving},
     )
 
 
