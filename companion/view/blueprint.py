@@ -119,7 +119,7 @@ def _map(run: Layout, trail: float) -> rrb.Spatial2DView:
 def _map_view(
     config: Config, root: str, title: str, moving: Iterable[str], trail: float
 ) -> rrb.Spatial2DView:
-    """The map below `root`, with a trail of so many seconds behind each entity that moves."""
+    """The map below `root`, with a trail of so many seconds behind what moves, and all its past closures."""
     corners = [position[:2] for position in config.anchors.values()]
     corners += [corner for wall in config.site.walls for corner in wall]
     (left, bottom), (right, top) = np.min(corners, axis=0) - _MARGIN, np.max(corners, axis=0) + _MARGIN
@@ -128,6 +128,9 @@ def _map_view(
         start=rrb.TimeRangeBoundary.cursor_relative(seconds=-trail),
         end=rrb.TimeRangeBoundary.cursor_relative(),
     )
+    past = rrb.VisibleTimeRanges(
+        timeline=TIME, start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.cursor_relative()
+    )
     return rrb.Spatial2DView(
         origin=root or "/",
         contents=f"/{root}map/**",
@@ -135,7 +138,10 @@ def _map_view(
         background=GROUND,
         # Seen from outside the mirroring transform of `map`, y runs from -top to -bottom.
         visual_bounds=rrb.VisualBounds2D(x_range=[left, right], y_range=[-top, -bottom]),
-        overrides={f"/{root}map/{name}/trail": visible for name in moving},
+        overrides={
+            **{f"/{root}map/{name}/trail": visible for name in moving},
+            **{f"/{root}map/{name}/closures": past for name in moving},
+        },
     )
 
 

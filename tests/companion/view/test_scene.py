@@ -21,10 +21,10 @@ from companion.sim.world import World
 from companion.view.files import RerunFiles
 from estimators.base import Verdict
 from estimators.messages import FloatArray, RangeFrame, Scan
+from tests.companion.view.recordings import Recording, read
 
 NAMES = ["ekf", "least_squares", "lidar_odometry"]
 GREEN, VERMILION, ORANGE, GREY = 0x009E73FF, 0xD55E00FF, 0xE69F00FF, 0x787878FF
-Recording = dict[str, dict[str, Any]]
 
 
 class Run:
@@ -57,16 +57,6 @@ class Run:
             view.tick(*change(i, tick, truth))
         view.close()
         return read(path)
-
-
-def read(path: Path) -> Recording:
-    """Entity -> component -> rows of all batches; a static component has one row."""
-    entities: Recording = {}
-    for chunk in RrdReader(path).stream().to_chunks():
-        entity = entities.setdefault(chunk.entity_path.removeprefix("/"), {})
-        for name, rows in chunk.to_record_batch().to_pydict().items():
-            entity.setdefault(name, []).extend(rows)
-    return entities
 
 
 @pytest.fixture(scope="module")

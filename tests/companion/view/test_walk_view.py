@@ -4,18 +4,17 @@ import os
 import signal
 import time
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import rerun as rr
-from rerun.chunk import RrdReader
 
 from companion.sim.robot import Robot
 from companion.sim.scenario import Scenario, load_scenario
 from companion.view.viewer import free_port
 from companion.view.walk_view import WalkScene, WalkView
 from estimators.messages import FloatArray
+from tests.companion.view.recordings import read
 from tests.conftest import Command, write_scenario
 
 GREEN, VERMILION = 0x009E73FF, 0xD55E00FF
@@ -41,15 +40,12 @@ def test_the_robot_stands_where_it_is_and_lines_tell_which_anchors_it_sees(
         scene.send(now_ns)
     stream.disconnect()
 
-    rows: dict[str, list[Any]] = {}
-    for chunk in RrdReader(tmp_path / "walk.rrd").stream().to_chunks():
-        for name, values in chunk.to_record_batch().to_pydict().items():
-            rows.setdefault(f"{chunk.entity_path} {name}", []).extend(values)
+    drawn = read(tmp_path / "walk.rrd")
     poses = np.array([robot.motion(now_ns).pose[0] for now_ns in stamps_ns])
-    assert np.array(rows["/map/truth/position Points2D:positions"])[:, 0] == pytest.approx(poses[:, :2])
-    x, y = np.array(rows["/map/truth/heading Arrows2D:vectors"])[:, 0].T
+    assert np.array(drawn["map/truth/position"]["Points2D:positions"])[:, 0] == pytest.approx(poses[:, :2])
+    x, y = np.array(drawn["map/truth/heading"]["Arrows2D:vectors"])[:, 0].T
     assert np.arctan2(y, x) == pytest.approx(poses[:, 2], abs=1e-6)
-    steps = np.array(rows["/map/truth/trail LineStrips2D:strips"])[:, 0]
+    steps = np.array(drawn["map/truth/trail"]["LineStrips2D:strips"])[:, 0]
     assert steps == pytest.approx(np.stack([poses[:-1, :2], poses[1:, :2]], axis=1), abs=1e-6)
 
     body, anchors = scenario.config.body, np.array(list(scenario.config.anchors.values()))
@@ -57,12 +53,12 @@ def test_the_robot_stands_where_it_is_and_lines_tell_which_anchors_it_sees(
     tags = poses[:, :2] + np.column_stack(
         [c * body.tag[0] - s * body.tag[1], s * body.tag[0] + c * body.tag[1]]
     )
-    lines = np.array(rows["/map/sight LineStrips2D:strips"])
+    lines = np.array(drawn["map/sight"]["LineStrips2D:strips"])
     assert lines[:, :, 0] == pytest.approx(np.repeat(tags[:, None], len(anchors), axis=1), abs=1e-5)
     assert lines[:, :, 1] == pytest.approx(np.repeat(anchors[None, :, :2], len(tags), axis=0), abs=1e-5)
     hidden = np.array([[crosses_column(tag, anchor[:2]) for anchor in anchors] for tag in tags])
     assert hidden.any()
-    colours = np.array(rows["/map/sight LineStrips2D:colors"])
+    colours = np.array(drawn["map/sight"]["LineStrips2D:colors"])
     assert (colours == np.where(hidden, VERMILION, GREEN)).all()
 
 
