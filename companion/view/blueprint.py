@@ -1,7 +1,7 @@
 """How a scene opens: which views there are, where, and on what scale."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import rerun.blueprint as rrb
@@ -61,7 +61,7 @@ def run_blueprint(run: Layout, trail: float, compares: bool) -> rrb.Blueprint:
                 _map(run, trail),
                 _lanes(run),
                 _log(run),
-                row_shares=[4.2, 2.0, 1.2],
+                row_shares=[4.0, _lanes_share(run), 1.4],
             ),
             rrb.Vertical(*_plots(run, errors)),
             column_shares=[1.5, 1.0],
@@ -84,9 +84,13 @@ def run_blueprint(run: Layout, trail: float, compares: bool) -> rrb.Blueprint:
 def comparison_blueprint(runs: Sequence[Layout]) -> rrb.Blueprint:
     """Runs beside each other, under one time cursor: maps, verdicts, errors, health."""
     columns = []
+    compared = ("error/position", "ranges/residual")
+    # One scale for all: what is larger is to look larger.
+    limits = {e: max((run.plots.get(e) or 0.0 for run in runs), default=0.0) or None for e in compared}
     for run in runs:
-        plots = _plots(run, ["error/position", "ranges/residual"])
-        shares = [4.0, 2.0, *(1.3 for _ in plots), 1.2]
+        run = replace(run, plots={e: limits[e] for e in compared if e in run.plots})
+        plots = _plots(run, compared)
+        shares = [3.2, 1.25 * _lanes_share(run), *(1.2 for _ in plots), 1.5]
         parts = [_map(run, REVIEW_TRAIL), _lanes(run), *plots, _log(run)]
         columns.append(rrb.Vertical(*parts, row_shares=shares, name=run.title))
     return _blueprint(rrb.Horizontal(*columns))
@@ -151,6 +155,11 @@ def _lanes(run: Layout) -> rrb.StateTimelineView:
         contents=[f"+ /{run.root}health/state", f"+ /{run.root}ranges/verdict/**"],
         name=f"{_title(run)}health, and verdict of {run.primary} on ranges",
     )
+
+
+def _lanes_share(run: Layout) -> float:
+    """Of the height: a lane for health and one for each anchor, up to half of what the map takes."""
+    return min(0.4 * (1.3 + len(run.config.anchors)), 3.0)
 
 
 def _log(run: Layout) -> rrb.TextLogView:

@@ -153,6 +153,15 @@ def test_what_is_no_shift_is_not_called_one(residual: Callable[[int, FloatArray,
     assert misses(residual).shift() is None
 
 
+def test_ranges_that_scatter_are_blocked_not_moved() -> None:
+    """Blocked ranges that happen to fit a shift, as behind a box on the way round."""
+    rng = np.random.default_rng(8)
+    moved = shifted(0.5, -0.4)
+    scattered = misses(lambda i, u, k: moved(i, u, k) + (i == 2) * rng.exponential(0.3)).shift()
+    assert misses(moved).shift() is not None
+    assert scattered is None
+
+
 def test_seen_from_one_place_no_shift_is_told() -> None:
     assert misses(shifted(0.4, -0.3), side=0.01).shift() is None
 
