@@ -25,6 +25,8 @@ EXPLAINED = 0.5
 """What a shift leaves of the misses."""
 NOISY = 2.0
 """What is left may be so many times the noise, in every third of the time."""
+SCATTERED = 2.0
+"""An anchor whose ranges scatter so many times as much as the others' is blocked, wherever it stands."""
 _BEGINNINGS = 20
 _ROUNDS = 15
 
@@ -52,12 +54,16 @@ class Shift:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Bin:
-    """What no pose explains: misses (n,) [m], and for each anchor what a shift of it would change, (n, 2)."""
+    """What no pose explains: misses (n,) [m], and for each anchor what a shift of it would change, (n, 2).
+
+    Besides, how much the ranges of each anchor scatter: their median absolute deviation [m].
+    """
 
     stamp_ns: int
     misses: FloatArray
     changes: dict[int, FloatArray]
     biases: dict[int, FloatArray]
+    scatter: dict[int, float]
 
 
 class RangeMisses:
@@ -100,12 +106,16 @@ class RangeMisses:
         ids = sorted(self._residuals)
         if self._begin_ns is not None and len(ids) >= LEAST_ANCHORS:
             residuals = np.array([np.median(self._residuals[i]) for i in ids])
+            scatter = {
+                i: float(np.median(np.abs(np.array(self._residuals[i]) - middle)))
+                for i, middle in zip(ids, residuals.tolist(), strict=True)
+            }
             directions = np.array([self._directions[i] for i in ids])
             # An error e of the pose changes residuals by -u e: what is orthogonal to that is left.
             free = np.eye(len(ids)) - directions @ np.linalg.pinv(directions)
             changes = {i: -np.outer(free[:, k], directions[k]) for k, i in enumerate(ids)}
             biases = {i: free[:, k] for k, i in enumerate(ids)}
-            self._bins.append(_Bin(self._begin_ns, free @ residuals, changes, biases))
+            self._bins.append(_Bin(self._begin_ns, free @ residuals, changes, biases, scatter))
         self._residuals = {}
 
     def _stacked(self, begin: int, anchor_id: int) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -128,12 +138,19 @@ class RangeMisses:
             and spread >= LEAST_SPREAD
             and after < EXPLAINED * before
             and _is_noise(left, noise)
+            and not self._is_scattered(begin, anchor_id)
         )
         if not is_shift:
             return None
         is_bias = _is_noise(y - bias @ constant, noise)
         since_ns = self._bins[begin].stamp_ns
         return Shift(anchor_id, since_ns, shift, float(constant[0]) if is_bias else None, before, after)
+
+    def _is_scattered(self, begin: int, anchor_id: int) -> bool:
+        """Whether an anchor's ranges scatter far more than the others' since a bin."""
+        its = [b.scatter[anchor_id] for b in self._bins[begin:] if anchor_id in b.scatter]
+        others = [s for b in self._bins[begin:] for i, s in b.scatter.items() if i != anchor_id]
+        return float(np.median(its)) > SCATTERED * float(np.median(others))
 
     def _noise(self, begin: int) -> float:
         """Median absolute noise of a miss [m]: from bin to bin neither a shift nor a bias changes much."""

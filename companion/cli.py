@@ -78,7 +78,7 @@ View = Annotated[
         "--view",
         metavar="WHERE",
         help="Show it in Rerun: web (a page for a browser, see the table view), native (a window on this "
-        "computer) or off. `run` shows it while it runs.",
+        "computer) or off. `run` and `emulate` show it while it runs.",
     ),
 ]
 
@@ -214,28 +214,37 @@ def simulate(
 
 
 @app.command()
-def emulate(scenario: Scenario_, seed: Seed = None, sets: Sets = None) -> None:
+def emulate(scenario: Scenario_, seed: Seed = None, view: View = "off", sets: Sets = None) -> None:
     """Put a scenario's sensors on pseudo-terminals, in real time. Ctrl-C ends it.
 
     Prints the ports and the command that uses them. The robot begins to walk when the host asks for scans.
+    --view shows where it truly is, and which anchors it sees.
     """
     from companion.sim.emulate import Emulator
 
     loaded = _load_scenario(scenario, seed, sets)
+    where = _shown(view)
     emulator = Emulator(loaded)
-    for name, port in emulator.ports.items():
-        out.print(f"{name}  {port.path}")
-    out.file.flush()
-    options = " ".join(f"--set sensor.{name}.port={port.path}" for name, port in emulator.ports.items())
-    site = _scenario_path(scenario).parent / loaded.file.site
-    err.print("In another terminal:")
-    err.print(f"  companion run --site {site.resolve()} {options}")
-    stop = threading.Event()
-    _stop_on_signal(stop)
+    shown = None
     try:
+        if where != "off":
+            from companion.view.walk_view import WalkView
+
+            shown = WalkView(emulator.robot, where, lambda line: err.print(line, soft_wrap=True))
+        for name, port in emulator.ports.items():
+            out.print(f"{name}  {port.path}")
+        out.file.flush()
+        options = " ".join(f"--set sensor.{name}.port={port.path}" for name, port in emulator.ports.items())
+        site = _scenario_path(scenario).parent / loaded.file.site
+        err.print("In another terminal:")
+        err.print(f"  companion run --site {site.resolve()} {options}")
+        stop = threading.Event()
+        _stop_on_signal(stop)
         emulator.run(stop, lambda line: err.print(line))
     finally:
         emulator.close()
+        if shown is not None:
+            shown.close()
 
 
 @app.command()

@@ -9,7 +9,7 @@ from companion.log import Truth
 from companion.pipeline import Tick
 from estimators.base import Report
 from estimators.geometry import wrap_angles
-from estimators.messages import FloatArray, IntArray, RangeFrame, Scan
+from estimators.messages import FloatArray, IntArray, LoopClosure, RangeFrame, Scan
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,6 +50,7 @@ class Batch:
         new: which of all ticks are to be drawn.
         frames: ranges taken in these ticks with the primary's report.
         scans: of these ticks, those without a beam left out.
+        closures: of these ticks with the reports on them; not those that only found a place.
     """
 
     def __init__(
@@ -65,12 +66,17 @@ class Batch:
         self.truths = truths
         self.frames: list[tuple[RangeFrame, Report]] = []
         self.scans: list[Scan] = []
+        self.closures: list[tuple[LoopClosure, dict[str, Report]]] = []
         for tick in ticks:
             for outcome in tick.outcomes:
                 if isinstance(outcome.measurement, RangeFrame):
                     self.frames.append((outcome.measurement, outcome.reports[names[0]]))
                 elif isinstance(outcome.measurement, Scan) and len(outcome.measurement.ranges):
                     self.scans.append(outcome.measurement)
+                elif isinstance(outcome.measurement, LoopClosure) and (
+                    outcome.measurement.from_stamp_ns < outcome.measurement.stamp_ns
+                ):
+                    self.closures.append((outcome.measurement, outcome.reports))
 
     def errors(self, name: str) -> FloatArray:
         """Pose minus truth (N, 3) at the ticks, yaw wrapped; NaN where either is not known."""

@@ -1,7 +1,7 @@
 """How a scene opens: which views there are, where, and on what scale."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import rerun.blueprint as rrb
@@ -61,7 +61,7 @@ def run_blueprint(run: Layout, trail: float, compares: bool) -> rrb.Blueprint:
                 _map(run, trail),
                 _lanes(run),
                 _log(run),
-                row_shares=[4.2, 2.0, 1.2],
+                row_shares=[4.0, _lanes_share(run), 1.4],
             ),
             rrb.Vertical(*_plots(run, errors)),
             column_shares=[1.5, 1.0],
@@ -84,15 +84,19 @@ def run_blueprint(run: Layout, trail: float, compares: bool) -> rrb.Blueprint:
 def comparison_blueprint(runs: Sequence[Layout]) -> rrb.Blueprint:
     """Runs beside each other, under one time cursor: maps, verdicts, errors, health."""
     columns = []
+    compared = ("error/position", "ranges/residual")
+    # One scale for all: what is larger is to look larger.
+    limits = {e: max((run.plots.get(e) or 0.0 for run in runs), default=0.0) or None for e in compared}
     for run in runs:
-        plots = _plots(run, ["error/position", "ranges/residual"])
-        shares = [4.0, 2.0, *(1.3 for _ in plots), 1.2]
+        run = replace(run, plots={e: limits[e] for e in compared if e in run.plots})
+        plots = _plots(run, compared)
+        shares = [3.2, 1.25 * _lanes_share(run), *(1.2 for _ in plots), 1.5]
         parts = [_map(run, REVIEW_TRAIL), _lanes(run), *plots, _log(run)]
         columns.append(rrb.Vertical(*parts, row_shares=shares, name=run.title))
     return _blueprint(rrb.Horizontal(*columns))
 
 
-def _blueprint(root: rrb.Container) -> rrb.Blueprint:
+def _blueprint(root: rrb.Container | rrb.View) -> rrb.Blueprint:
     return rrb.Blueprint(
         root,
         rrb.SelectionPanel(state="hidden"),
@@ -102,26 +106,46 @@ def _blueprint(root: rrb.Container) -> rrb.Blueprint:
     )
 
 
+def walk_blueprint(config: Config) -> rrb.Blueprint:
+    """The map alone, of a robot whose true walk is known."""
+    title = "truth, x right, y up: robot white, free lines of sight green, blocked vermilion"
+    return _blueprint(_map_view(config, "", title, ["truth"], LIVE_TRAIL))
+
+
 def _map(run: Layout, trail: float) -> rrb.Spatial2DView:
-    corners = [position[:2] for position in run.config.anchors.values()]
-    corners += [corner for wall in run.config.site.walls for corner in wall]
+    shown = [f"{run.primary} blue"]
+    shown += ["truth white"] if run.has_truth else []
+    shown += ["autopilot orange"] if run.has_autopilot else []
+    title = f"{_title(run)}map, x right, y up: {', '.join(shown)}"
+    return _map_view(run.config, run.root, title, [f"estimate/{name}" for name in run.names], trail)
+
+
+def _map_view(
+    config: Config, root: str, title: str, moving: Iterable[str], trail: float
+) -> rrb.Spatial2DView:
+    """The map below `root`, with a trail of so many seconds behind what moves, and all its past closures."""
+    corners = [position[:2] for position in config.anchors.values()]
+    corners += [corner for wall in config.site.walls for corner in wall]
     (left, bottom), (right, top) = np.min(corners, axis=0) - _MARGIN, np.max(corners, axis=0) + _MARGIN
     visible = rrb.VisibleTimeRanges(
         timeline=TIME,
         start=rrb.TimeRangeBoundary.cursor_relative(seconds=-trail),
         end=rrb.TimeRangeBoundary.cursor_relative(),
     )
-    shown = [f"{run.primary} blue"]
-    shown += ["truth white"] if run.has_truth else []
-    shown += ["autopilot orange"] if run.has_autopilot else []
+    past = rrb.VisibleTimeRanges(
+        timeline=TIME, start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.cursor_relative()
+    )
     return rrb.Spatial2DView(
-        origin=run.root or "/",
-        contents=f"/{run.root}map/**",
-        name=f"{_title(run)}map, x right, y up: {', '.join(shown)}",
+        origin=root or "/",
+        contents=f"/{root}map/**",
+        name=title,
         background=GROUND,
         # Seen from outside the mirroring transform of `map`, y runs from -top to -bottom.
         visual_bounds=rrb.VisualBounds2D(x_range=[left, right], y_range=[-top, -bottom]),
-        overrides={f"/{run.root}map/estimate/{name}/trail": visible for name in run.names},
+        overrides={
+            **{f"/{root}map/{name}/trail": visible for name in moving},
+            **{f"/{root}map/{name}/closures": past for name in moving},
+        },
     )
 
 
@@ -131,6 +155,11 @@ def _lanes(run: Layout) -> rrb.StateTimelineView:
         contents=[f"+ /{run.root}health/state", f"+ /{run.root}ranges/verdict/**"],
         name=f"{_title(run)}health, and verdict of {run.primary} on ranges",
     )
+
+
+def _lanes_share(run: Layout) -> float:
+    """Of the height: a lane for health and one for each anchor, up to half of what the map takes."""
+    return min(0.4 * (1.3 + len(run.config.anchors)), 3.0)
 
 
 def _log(run: Layout) -> rrb.TextLogView:

@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from companion.view.scene import Scene
 
 Item: TypeAlias = Tick | RawChunk | Line | Truth
-KEEPS_UP = 1.0
-"""A viewer that has not taken a batch after so long [s] is not sent another before it has."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +73,7 @@ def draw(pipe: Connection, drawing: Drawing) -> None:
         try:
             if drawing.mode != "off":
                 viewer = Viewer(drawing.mode, config.view)
-                outlets.append(Window(config, drawing, viewer))
+                outlets.append(_LiveScene(config, drawing, viewer))
                 pipe.send(f"open {viewer.page}" if viewer.page else "window open")
             if drawing.files is not None:
                 outlets.append(_Files(config, drawing, drawing.files))
@@ -93,69 +91,36 @@ def draw(pipe: Connection, drawing: Drawing) -> None:
                 outlet.close()
 
 
-class Window:
-    """A viewer that is sent a live scene no faster than it takes it.
-
-    Args:
-        config: of the site.
-        drawing: what to draw.
-        viewer: that is to show it.
-
-    Raises:
-        UserError: the viewer does not start.
-    """
+class _LiveScene:
+    """A live scene in a viewer."""
 
     def __init__(self, config: Config, drawing: Drawing, viewer: Viewer) -> None:
         # Rerun loads slowly: only the process that draws waits for it.
-        import rerun as rr
-
         from companion.view.blueprint import LIVE_TRAIL, run_blueprint
-        from companion.view.files import APPLICATION
         from companion.view.scene import Scene
+        from companion.view.window import Window
 
-        viewer.wait_until_ready()
-        self._viewer = viewer
-        self._stream = rr.RecordingStream(APPLICATION)
-        self._stream.connect_grpc(viewer.url)
-        self._stream.send_recording_name(f"{config.site.name}, live")
-        self._scene = Scene(config, drawing.names, self._stream, drawing.start_ns, ends=False)
+        self._window = Window(viewer, f"{config.site.name}, live")
+        self._scene = Scene(config, drawing.names, self._window.stream, drawing.start_ns, ends=False)
         self._run_blueprint, self._trail = run_blueprint, LIVE_TRAIL
         self._plots: set[str] = set()
-        self._keeps_up = True
 
     def take(self, items: list[Item]) -> None:
-        """Draw items, unless the viewer has not yet taken what it was sent before.
-
-        Raises:
-            UserError: the viewer was closed, or died.
-        """
-        if not self._viewer.is_running:
+        if not self._window.is_open:
             raise UserError("the viewer was closed")
-        if not self._keeps_up and not self._is_taken():
+        if not self._window.is_ready():
             return
         _show(self._scene, items)
         self._scene.send()
         plots = set(self._scene.layout().plots)
         if plots != self._plots:
             self._plots = plots
-            self._stream.send_blueprint(self._run_blueprint(self._scene.layout(), self._trail, False))
-        self._is_taken()
+            blueprint = self._run_blueprint(self._scene.layout(), self._trail, False)
+            self._window.stream.send_blueprint(blueprint)
+        self._window.take()
 
     def close(self) -> None:
-        """End a page; a window stays until it is closed, unless it has stalled."""
-        if self._is_taken() and not self._viewer.is_page:
-            self._stream.disconnect()
-        else:
-            # First the viewer: a stream that waits for it would never end.
-            self._viewer.kill()
-
-    def _is_taken(self) -> bool:
-        try:
-            self._stream.flush(timeout_sec=KEEPS_UP)
-            self._keeps_up = True
-        except RuntimeError:
-            self._keeps_up = False
-        return self._keeps_up
+        self._window.close()
 
 
 class _Files:

@@ -13,6 +13,7 @@ import rerun as rr
 from companion.config import Config
 from companion.view.anchor_marks import AnchorMarks
 from companion.view.batch import Batch
+from companion.view.closures import send_closures
 from companion.view.entities import Entities
 from companion.view.palette import (
     GREY,
@@ -69,6 +70,7 @@ class MapScene:
             layer = 40.0 if name == self._primary else 20.0
             self._send_pose(f"map/estimate/{name}", batch, name, self.colours[name], layer)
             self._send_sketches(f"map/estimate/{name}", batch, name)
+        send_closures(self._entities, batch)
         self._send_covariance(batch)
         self._send_truth(batch)
         self._send_scans(batch)

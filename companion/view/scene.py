@@ -112,6 +112,7 @@ class Scene:
         self._mark(self._finder.close())
         self._send_link()
         if self._ends:
+            self._states.close()
             self._map.close()
             self._plots.close()
 

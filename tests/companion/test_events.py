@@ -17,7 +17,14 @@ from companion.sim.scenario import load_scenario
 from estimators.messages import FloatArray
 from tests.conftest import SITE, write_log
 
-WALK = "[trajectory]\nwaypoints = [[1.5, 1.2], [6.0, 1.2], [6.0, 5.5]]\nlaps = 0\nspeed = 0.8\n"
+WALK = """
+[lidar] # the one with the fewest points: every log here is simulated and replayed
+model = "A1"
+[trajectory]
+waypoints = [[1.5, 1.2], [6.0, 1.2], [6.0, 5.5]]
+laps = 0
+speed = 0.8
+"""
 
 
 @pytest.fixture(scope="module")
@@ -61,28 +68,19 @@ def test_nothing_happens_in_an_empty_room(walk: Path) -> None:
     assert titles(events_of(walk)) == []
 
 
-def test_an_nlos_burst_is_named_with_anchor_time_and_reason(walk: Path, tmp_path: Path) -> None:
-    events = edited(walk, tmp_path, "nlos:anchor=2,at=6,for=3")
-    assert titles(events) == ["A2 blocked (first NLOS)"]
-    ((seconds, event),) = events
-    assert seconds == pytest.approx(6.0, abs=0.2)
-    assert event.text.startswith("NLOS: longer than predicted")
-
-
-def test_a_lidar_blackout_is_named_with_its_length(walk: Path, tmp_path: Path) -> None:
-    events = edited(walk, tmp_path, "silent:sensor=lidar,at=6,for=3")
-    at, event = next(found for found in events if found[1].title == "LiDAR blackout")
-    assert at == pytest.approx(6.0, abs=0.3)
-    assert "no scan for 3." in event.text
-    assert not any("A" in title[:1] and title[1:2].isdigit() for title in titles(events))
-
-
-def test_an_anchor_that_falls_silent_is_lost(walk: Path, tmp_path: Path) -> None:
-    events = edited(walk, tmp_path, "drop:anchor=3,at=5")
-    ((seconds, event),) = events
-    assert event.title == "A3 lost"
-    assert seconds == pytest.approx(5.0, abs=0.1)
-    assert event.text.count("until the end") == 1
+def test_three_faults_of_one_run_are_named_each_with_its_time_and_reason(walk: Path, tmp_path: Path) -> None:
+    faults = ("nlos:anchor=2,at=4,for=3", "silent:sensor=lidar,at=9,for=3", "drop:anchor=3,at=15")
+    found = {event.title: (seconds, event.text) for seconds, event in edited(walk, tmp_path, *faults)}
+    assert [title for title in found if title[0] == "A"] == ["A2 blocked (first NLOS)", "A3 lost"]
+    seconds, text = found["A2 blocked (first NLOS)"]
+    assert seconds == pytest.approx(4.0, abs=0.2)
+    assert text.startswith("NLOS: longer than predicted")
+    seconds, text = found["LiDAR blackout"]
+    assert seconds == pytest.approx(9.0, abs=0.3)
+    assert "no scan for 3." in text
+    seconds, text = found["A3 lost"]
+    assert seconds == pytest.approx(15.0, abs=0.1)
+    assert text.count("until the end") == 1
 
 
 @pytest.mark.parametrize(("anchor", "x", "y", "at"), [(3, -0.4, 0.3, 0.0), (1, 0.5, 0.0, 6.0)])
@@ -151,6 +149,15 @@ def test_a_bias_is_offered_where_it_explains_as_much() -> None:
 )
 def test_what_is_no_shift_is_not_called_one(residual: Callable[[int, FloatArray, int], float]) -> None:
     assert misses(residual).shift() is None
+
+
+def test_ranges_that_scatter_are_blocked_not_moved() -> None:
+    """Blocked ranges that happen to fit a shift, as behind a box on the way round."""
+    rng = np.random.default_rng(8)
+    moved = shifted(0.5, -0.4)
+    scattered = misses(lambda i, u, k: moved(i, u, k) + (i == 2) * rng.exponential(0.3)).shift()
+    assert misses(moved).shift() is not None
+    assert scattered is None
 
 
 def test_seen_from_one_place_no_shift_is_told() -> None:

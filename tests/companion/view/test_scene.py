@@ -1,7 +1,9 @@
 """The Rerun recording of a replay, read back from its file."""
 
+import itertools
 import resource
 import sys
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -21,10 +23,10 @@ from companion.sim.world import World
 from companion.view.files import RerunFiles
 from estimators.base import Verdict
 from estimators.messages import FloatArray, RangeFrame, Scan
+from tests.companion.view.recordings import Recording, read
 
 NAMES = ["ekf", "least_squares", "lidar_odometry"]
 GREEN, VERMILION, ORANGE, GREY = 0x009E73FF, 0xD55E00FF, 0xE69F00FF, 0x787878FF
-Recording = dict[str, dict[str, Any]]
 
 
 class Run:
@@ -57,16 +59,6 @@ class Run:
             view.tick(*change(i, tick, truth))
         view.close()
         return read(path)
-
-
-def read(path: Path) -> Recording:
-    """Entity -> component -> rows of all batches; a static component has one row."""
-    entities: Recording = {}
-    for chunk in RrdReader(path).stream().to_chunks():
-        entity = entities.setdefault(chunk.entity_path.removeprefix("/"), {})
-        for name, rows in chunk.to_record_batch().to_pydict().items():
-            entity.setdefault(name, []).extend(rows)
-    return entities
 
 
 @pytest.fixture(scope="module")
@@ -159,22 +151,49 @@ def test_plots_hold_errors_residuals_nis_and_gate(run: Run, recording: Recording
     assert accepted <= sum(value <= gate for value in nis) < len(nis)
 
 
-def test_each_anchor_has_a_lane_with_the_changes_of_its_verdict(run: Run, recording: Recording) -> None:
-    reports = [
-        o.reports["ekf"]
-        for tick, _ in run.ticks
-        for o in tick.outcomes
-        if isinstance(o.measurement, RangeFrame)
-    ]
+def test_a_lane_tells_what_became_of_most_ranges_of_an_anchor_in_half_a_second(
+    run: Run, recording: Recording
+) -> None:
+    told = {i: dict[float, str]() for i in run.config.anchors}
+    for i, states in told.items():
+        rows = recording[f"ranges/verdict/A{i}"]
+        times = [time.total_seconds() for time in rows["time"]]
+        states |= dict(zip(times, (state for (state,) in rows["StateChange:state"]), strict=True))
+        assert all(a != b for a, b in itertools.pairwise(states.values()))
+    begin_ns, seen = run.ticks[0][0].stamp_ns, set()
+    for k in range(0, len(run.ticks), 15):
+        window = [o for tick, _ in run.ticks[k : k + 15] for o in tick.outcomes]
+        time = (run.ticks[k][0].stamp_ns - begin_ns) * 1e-9
+        for i in run.config.anchors:
+            given = [
+                verdict
+                for o in window
+                if isinstance(o.measurement, RangeFrame)
+                for anchor_id, verdict in zip(
+                    o.measurement.anchor_ids, o.reports["ekf"].verdicts, strict=True
+                )
+                if anchor_id == i
+            ]
+            used = [verdict.is_used for verdict in given]
+            state = [states for at, states in told[i].items() if at <= time + 1e-6][-1]
+            if sum(used) * 2 != len(used):
+                assert Verdict(state).is_used == (sum(used) * 2 > len(used))
+                votes = Counter(v for v in given if v.is_used == Verdict(state).is_used)
+                assert votes[Verdict(state)] == max(votes.values())
+                seen.add(state)
+    assert len(seen) > 1
+
+
+def test_an_anchor_that_is_not_heard_any_more_has_a_lane_that_says_so(run: Run, tmp_path: Path) -> None:
+    def without_ranges(i: int, tick: Tick, truth: Truth | None) -> tuple[Tick, Truth | None]:
+        outcomes = [o for o in tick.outcomes if i < 150 or not isinstance(o.measurement, RangeFrame)]
+        return replace(tick, outcomes=outcomes), truth
+
+    recording = run.show(tmp_path / "run.rrd", change=without_ranges)
     for i in run.config.anchors:
-        given = [
-            verdict
-            for frame, report in zip(run.measurements(RangeFrame), reports, strict=True)
-            for anchor_id, verdict in zip(frame.anchor_ids.tolist(), report.verdicts, strict=True)
-            if anchor_id == i
-        ]
-        changes = [b for a, b in zip([None, *given], given, strict=False) if a is not b]
-        assert [state for (state,) in recording[f"ranges/verdict/A{i}"]["StateChange:state"]] == changes
+        rows = recording[f"ranges/verdict/A{i}"]
+        assert rows["StateChange:state"][-1] == ["no range"]
+        assert 5.0 < rows["time"][-1].total_seconds() <= 6.5
 
 
 def test_health_changes_are_a_state_and_a_line_of_text(run: Run, recording: Recording) -> None:
@@ -321,5 +340,5 @@ def test_small_batches_draw_what_one_large_one_draws(
         ("error/position/ekf", "Scalars:scalars"),
         ("ranges/verdict/A1", "StateChange:state"),
     ):
-        rows = [dict(zip(r[entity]["time"], r[entity][component], strict=True)) for r in (small, recording)]
+        rows = [list(zip(r[entity]["time"], r[entity][component], strict=True)) for r in (small, recording)]
         assert str(rows[0]) == str(rows[1]), entity
