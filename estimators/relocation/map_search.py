@@ -37,7 +37,6 @@ class MapSearch:
         self._relocaliser = Relocaliser(Relocaliser.Config(range_sigma=range_sigma), floor, setup)
         self._preparation = ScanPreparation(ScanPreparation.Config(), setup.lidar_in_body)
         self._across = floor.cell * float(np.hypot(*floor.occupied.shape))
-        self._anchors = setup.anchors
         self.reset()
 
     def reset(self) -> None:
@@ -55,9 +54,8 @@ class MapSearch:
         self._scan = scan
 
     def add_ranges(self, frame: RangeFrame) -> None:
-        """Keep the newest frame with enough known anchors."""
-        if sum(anchor_id in self._anchors for anchor_id in frame.anchor_ids.tolist()) >= LEAST_RANGES:
-            self._ranges = frame
+        """Keep the newest frame, which must have `LEAST_RANGES` usable ranges."""
+        self._ranges = frame
 
     def add_increment(self, measured: PoseIncrement) -> None:
         """Note whether the robot stands, from an increment that is known to be good."""

@@ -9,7 +9,7 @@ from estimators.base import Report, Settable, Setup, Sketch, Sketched, Verdict
 from estimators.geometry import compose, inverse
 from estimators.messages import FloatArray, Measurement, PoseEstimate, PoseIncrement, RangeFrame, Scan
 from estimators.range_gate import HorizontalRanges
-from estimators.relocation.map_search import MapSearch
+from estimators.relocation.map_search import LEAST_RANGES, MapSearch
 from estimators.relocation.search import Minimum, agreeing, find_pose, lies_outside, too_short, total_loss
 from estimators.relocation.window import PlacedRanges, Window
 
@@ -272,7 +272,7 @@ def _show(in_map: MapSearch, measurement: Measurement, verdicts: list[Verdict]) 
     """Hand on what a search in the map needs, if it is good for anything."""
     if isinstance(measurement, Scan):
         in_map.add_scan(measurement)
-    elif Verdict.WAITING in verdicts and isinstance(measurement, RangeFrame):
+    elif isinstance(measurement, RangeFrame) and verdicts.count(Verdict.WAITING) >= LEAST_RANGES:
         in_map.add_ranges(measurement)
-    elif Verdict.WAITING in verdicts and isinstance(measurement, PoseIncrement):
+    elif isinstance(measurement, PoseIncrement) and verdicts == [Verdict.WAITING]:
         in_map.add_increment(measurement)
