@@ -75,11 +75,11 @@ class MapTable(BaseModel):
         """
         count = self.rows * self.columns
         try:
-            # No more than is wanted, whatever the text claims to hold.
-            data = zlib.decompressobj().decompress(b64decode(self.cells, validate=True), count)
+            # One byte more than is wanted tells that there are more; all might not fit into memory.
+            data = zlib.decompressobj().decompress(b64decode(self.cells, validate=True), count + 1)
         except (Base64Error, zlib.error) as error:
             raise ValueError(f"{self.name}: the cells are damaged ({error})") from error
         if len(data) != count:
-            raise ValueError(f"{self.name}: the cells are damaged ({len(data)} of {count})")
+            raise ValueError(f"{self.name}: the cells are damaged (not {count} of them)")
         cells = np.frombuffer(data, dtype=np.uint8).reshape(self.rows, self.columns)
         return FloorMap(cells == _OCCUPIED, cells == _FREE, self.cell, np.array(self.origin))

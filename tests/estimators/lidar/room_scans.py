@@ -51,6 +51,7 @@ def drawn(walls: FloatArray, T_map_grid: FloatArray) -> FloorMap:
     share = np.linspace(0.0, 1.0, 2000)[:, None, None]
     on_wall = (corners[:, 0] + share * (corners[:, 1] - corners[:, 0])).reshape(-1, 2)
     cells = np.floor(on_wall / CELL).astype(int)
+    assert (cells >= 0).all()
     occupied = np.zeros(cells.max(axis=0)[::-1] + 3, dtype=bool)
     occupied[cells[:, 1], cells[:, 0]] = True
     return FloorMap(occupied, ~occupied, CELL, T_map_grid)

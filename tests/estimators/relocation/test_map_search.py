@@ -21,7 +21,7 @@ PERIOD_NS = SECOND_NS // 10
 EMPTY = rectangle(0.0, 0.0, 5.0, 5.0)
 FURNISHED = np.vstack([ROOM, rectangle(0.0, 3.3, 2.2, 4.5), rectangle(5.3, 0.0, 6.0, 0.9)])
 """Turned by half a circle it looks clearly different."""
-ASKEW = np.array([1.0, -3.0, 0.7])
+ASKEW = np.array([1.0, -6.0, 0.7])
 MOUNTING = np.array([0.1, -0.05, 0.7])
 POSE = np.array([1.7, 1.4, 0.5])
 SETUP = Setup(
