@@ -24,6 +24,7 @@ from pydantic import (
 from companion.errors import UserError
 from companion.map_table import MapTable
 from companion.mavlink_table import MavlinkTable
+from companion.text_file import read_text
 from drivers import SENSORS, sensor_config_class
 from drivers.errors import PortError
 from drivers.port import parse_address
@@ -410,20 +411,6 @@ def default_toml() -> str:
     del data["anchors"], data["sensor"]
     data["start"] = {k: v for k, v in data["start"].items() if k not in start}
     return tomli_w.dumps(_toml_ready(data))
-
-
-def read_text(path: Path) -> str:
-    """Text of a file the user named.
-
-    Raises:
-        UserError: it cannot be read, or is not text.
-    """
-    try:
-        return path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise UserError(f"cannot read {path}: {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise UserError(f"{path} is not a text file: {error.reason} at byte {error.start}") from error
 
 
 def parse_toml(text: str, origin: str) -> dict[str, Any]:

@@ -7,8 +7,9 @@ import tomlkit
 from tomlkit.items import Table
 
 from companion.calibration.ranges import Calibration
-from companion.config import config_from_toml, read_text
+from companion.config import config_from_toml
 from companion.errors import UserError
+from companion.text_file import read_text
 
 
 def write_range_bias(site: Path, calibration: Calibration, to: Path) -> None:
