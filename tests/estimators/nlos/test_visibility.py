@@ -9,6 +9,7 @@ import pytest
 from estimators import estimator_config_class, make_estimator
 from estimators.base import Setup, Start, Verdict
 from estimators.geometry import compose, lift
+from estimators.lidar.floor_map import FloorMap
 from estimators.lidar.occupancy_grid import OccupancyGrid
 from estimators.messages import FloatArray, PoseEstimate, PoseIncrement, Scan
 from estimators.nlos.visibility import OBSTRUCTED, PERIOD_NS, Visibility
@@ -199,6 +200,15 @@ def test_no_ray_slips_between_the_cells_of_a_map_that_lies_askew() -> None:
     visibility = Visibility(2.0, replace(SETUP, floor_map=drawn(ROOM, np.array([1.0, -6.0, 0.7]))))
     rng = np.random.default_rng(0)
     for x, y, yaw in rng.uniform([0.5, 0.5, -3.0], [3.8, 4.0, 3.0], (200, 3)):
+        beyond = np.array([7.0, rng.uniform(0.5, 4.0), 2.1])
+        assert visibility.log_ratio(np.array([x, y, yaw]), beyond) == OBSTRUCTED
+
+
+def test_no_ray_slips_through_cells_larger_than_those_of_the_grid() -> None:
+    wall = FloorMap(np.ones((40, 1), bool), np.zeros((40, 1), bool), 0.2, np.array([4.5, -1.0, 0.2]))
+    visibility = Visibility(2.0, replace(SETUP, floor_map=wall))
+    rng = np.random.default_rng(0)
+    for x, y, yaw in rng.uniform([0.5, 0.5, -3.0], [2.3, 4.0, 3.0], (200, 3)):
         beyond = np.array([7.0, rng.uniform(0.5, 4.0), 2.1])
         assert visibility.log_ratio(np.array([x, y, yaw]), beyond) == OBSTRUCTED
 

@@ -157,8 +157,35 @@ def test_a_place_that_the_ranges_contradict_is_not_taken() -> None:
     _, now_ns = feed(estimator, stream(ROOM, standing(POSE), 1.0, excess={1: 1.5, 2: 1.0}))
     assert estimator.pose_at(now_ns) is None
     estimator.reset()
-    _, now_ns = feed(estimator, stream(ROOM, standing(POSE), 1.0, excess={1: 1.5}))
-    assert_at(estimator, now_ns, POSE)
+    # Nothing shortens a range: one that is too short speaks against the place.
+    notes, now_ns = feed(estimator, stream(ROOM, standing(POSE), 1.0, excess={3: -0.8}))
+    assert estimator.pose_at(now_ns) is None
+    assert notes[-1] == "ranges contradict, 75% agree"
+
+
+def test_one_blocked_anchor_of_four_neither_hides_the_place_nor_sets_the_filter_again() -> None:
+    estimator = recovering(in_map(ROOM))
+    _, now_ns = feed(estimator, stream(ROOM, standing(POSE), 4.5, excess={1: 1.5}))
+    assert assert_at(estimator, now_ns, POSE) == 1
+
+
+def test_a_wrong_start_mark_is_put_right_before_the_robot_moves() -> None:
+    mark = POSE + np.array([1.5, 1.0, 1.2])
+    estimator = recovering(replace(in_map(ROOM), start=Start(mark, np.array([0.05, 0.05, 0.03]))))
+    _, now_ns = feed(estimator, stream(ROOM, standing(POSE), 3.0))
+    assert assert_at(estimator, now_ns, POSE) == 1
+
+
+def test_a_scan_mostly_from_beyond_the_map_has_no_place_in_it() -> None:
+    estimator = recovering(in_map(FURNISHED, np.array([-0.2, -0.2, 0.0])))
+    for measurement in stream(FURNISHED, standing(POSE), 3.0):
+        changed = measurement
+        if isinstance(measurement, Scan):
+            beyond = np.arange(len(measurement.ranges)) % 5 < 3
+            changed = replace(measurement, ranges=np.where(beyond, 11.0, measurement.ranges))
+        note = estimator.update(changed).note
+        assert estimator.pose_at(measurement.stamp_ns) is None
+    assert note == "scan not in the map, drive a metre"
 
 
 def test_a_robot_that_moves_is_not_held_against_the_map() -> None:
@@ -201,6 +228,9 @@ def test_the_found_pose_holds_where_the_robot_is_and_not_where_its_keyframe_was(
         estimator, iter(next(replaced) if isinstance(m, PoseIncrement) else m for m in drive + rest)
     )
     assert_at(estimator, now_ns, stop)
+    found = estimator.pose_at(now_ns)
+    assert found is not None
+    assert np.sqrt(np.diag(found.planar_cov)[:2]).max() < 0.05
 
 
 def test_scans_without_sense_give_no_pose_and_no_error() -> None:
