@@ -22,7 +22,9 @@ from pydantic import (
 )
 
 from companion.errors import UserError
+from companion.map_table import MapTable
 from companion.mavlink_table import MavlinkTable
+from companion.text_file import read_text
 from drivers import SENSORS, sensor_config_class
 from drivers.errors import PortError
 from drivers.port import parse_address
@@ -71,6 +73,11 @@ class SiteTable(Table):
         "scans against them [m]",
     )
     origin: OriginTable | None = Field(None, description="where the map's origin is on Earth")
+    map: MapTable | None = Field(
+        None,
+        description="in a site file the name of a map's YAML file, seen from the site file: it tells blocked "
+        "ranges, serves scan_likelihood, and finds an unknown or lost pose at a standstill",
+    )
 
 
 class BodyTable(Table):
@@ -298,10 +305,11 @@ class Config(Table):
     @classmethod
     def _estimator_settings(cls, settings: Any, info: Any) -> Any:
         tables = _estimator_tables().model_validate(settings)
-        has_walls = "site" in info.data and any(len(wall) > 1 for wall in info.data["site"].walls)
+        site = info.data.get("site")
+        has_walls = site is not None and (site.map is not None or any(len(wall) > 1 for wall in site.walls))
         for name in ESTIMATORS:
             if getattr(getattr(tables, name), "scan_likelihood", False) and not has_walls:
-                raise ValueError(f"{name}.scan_likelihood needs a wall in site.walls")
+                raise ValueError(f"{name}.scan_likelihood needs a wall in site.walls, or site.map")
         return tables
 
     @field_validator("relocation")
@@ -337,6 +345,7 @@ class Config(Table):
             level_sigma=float(np.deg2rad(body.level_sigma_deg)),
             walls=[np.array(wall) for wall in self.site.walls],
             lidar_in_body=self.lidar_mounting(),
+            floor_map=self.site.map.floor_map() if self.site.map is not None else None,
         )
 
     def range_biases(self) -> dict[int, RangeBias]:
@@ -369,18 +378,26 @@ def load_config(site: Path, sets: Sequence[str] = ()) -> Config:
     Raises:
         UserError: file missing or not TOML, unknown key, bad value: named with the limit it breaks.
     """
-    return config_from_toml(read_text(site), str(site), sets)
+    return config_from_toml(read_text(site), str(site), sets, site.parent)
 
 
-def config_from_toml(text: str, origin: str, sets: Sequence[str] = ()) -> Config:
-    """Check a configuration text; `origin` names it in errors.
+def config_from_toml(text: str, origin: str, sets: Sequence[str] = (), folder: Path | None = None) -> Config:
+    """Check a configuration text.
+
+    Args:
+        text: TOML.
+        origin: names it in errors.
+        sets: `--set` assignments; a map that they name is looked for from the working directory on.
+        folder: where a map that the text names is looked for; None: likewise.
 
     Raises:
         UserError: as `load_config`.
     """
     data = parse_toml(text, origin)
+    _read_map(data, origin, folder or Path())
     for assignment in sets:
         apply_set(data, assignment)
+    _read_map(data, origin, Path())
     return validated(Config, data, origin)
 
 
@@ -394,20 +411,6 @@ def default_toml() -> str:
     del data["anchors"], data["sensor"]
     data["start"] = {k: v for k, v in data["start"].items() if k not in start}
     return tomli_w.dumps(_toml_ready(data))
-
-
-def read_text(path: Path) -> str:
-    """Text of a file the user named.
-
-    Raises:
-        UserError: it cannot be read, or is not text.
-    """
-    try:
-        return path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise UserError(f"cannot read {path}: {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise UserError(f"{path} is not a text file: {error.reason} at byte {error.start}") from error
 
 
 def parse_toml(text: str, origin: str) -> dict[str, Any]:
@@ -463,6 +466,24 @@ def validated(model: type[M], data: dict[str, Any], origin: str) -> M:
             reason += f", got {first['input']!r}"
         more = f" (and {len(others)} more)" if others else ""
         raise UserError(f"{origin}: {key}: {reason}{more}") from error
+
+
+def _read_map(data: dict[str, Any], origin: str, folder: Path) -> None:
+    """Put the map itself where data names its file."""
+    site = data.get("site")
+    if not isinstance(site, dict) or not isinstance(site.get("map"), str):
+        return
+    # Only who has a map waits for what reads pictures.
+    from companion.map_file import load_map
+
+    name = site["map"]
+    try:
+        site["map"] = MapTable.of(load_map(folder / name), name)
+    except UserError as error:
+        raise UserError(f"{origin}: site.map: {error}") from error
+    except ValidationError as error:
+        reason = error.errors()[0]["msg"].removeprefix("Value error, ")
+        raise UserError(f"{origin}: site.map: {reason}") from error
 
 
 def params_dir() -> Path:

@@ -8,8 +8,8 @@ import yaml
 from PIL import Image, UnidentifiedImageError
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from companion.config import read_text
 from companion.errors import UserError
+from companion.text_file import read_text
 from estimators.lidar.floor_map import FloorMap
 
 OCCUPIED_THRESH, FREE_THRESH = 0.65, 0.196

@@ -6,6 +6,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
+from estimators.lidar.floor_map import FloorMap
 from estimators.messages import PLANAR, FloatArray, Measurement, PoseEstimate
 
 
@@ -111,6 +112,7 @@ class Setup:
         landmarks: landmark id -> position (2,) [m], map frame; those that are known beforehand.
         walls: polylines (N, 2) [m], map frame.
         lidar_in_body: (3,) x [m], y [m], yaw [rad] of the LiDAR in the body frame.
+        floor_map: made on an earlier visit, with at least one obstacle; None without.
     """
 
     anchors: dict[int, FloatArray]
@@ -122,6 +124,7 @@ class Setup:
     landmarks: dict[int, FloatArray] = field(default_factory=dict)
     walls: list[FloatArray] = field(default_factory=list)
     lidar_in_body: FloatArray = field(default_factory=lambda: np.zeros(3))
+    floor_map: FloorMap | None = None
 
     def height_to(self, anchor: FloatArray) -> float:
         """Height of an anchor above the tag [m]."""

@@ -48,10 +48,12 @@ class ParticleFilter(ParticleCloud):
             0.03, gt=0, le=1, description="standard deviation of the gyroscope, bias included [rad/s]"
         )
         scan_likelihood: bool = Field(
-            False, description="scans weigh the particles by their distance from the walls of the site"
+            False,
+            description="scans weigh the particles by their distance from the obstacles of the site's map, "
+            "or without one from its walls",
         )
         scan_sigma: float = Field(
-            0.05, gt=0, le=1, description="standard deviation of that distance, walls' errors included [m]"
+            0.05, gt=0, le=1, description="standard deviation of that distance, the map's errors included [m]"
         )
         bandwidth: float = Field(
             1.0,
@@ -68,7 +70,7 @@ class ParticleFilter(ParticleCloud):
         self._uses_imu = config.motion == "imu"
         self._gyro_sigma = config.gyro_sigma
         self._gyro_gate = float(chi2.ppf(config.increment_gate, 1))
-        self._field = LikelihoodField.from_walls(setup.walls) if config.scan_likelihood else None
+        self._field = _field_of(setup) if config.scan_likelihood else None
         self._scan_sigma = config.scan_sigma
         super().__init__(config, setup)
 
@@ -145,6 +147,12 @@ class ParticleFilter(ParticleCloud):
         width = self._bandwidth * _best_width(count)
         self._particles = self._cloud.resampled(self._particles, self._weights, kept, self._noise(), width)
         self._weights = np.full(count, 1.0 / count)
+
+
+def _field_of(setup: Setup) -> LikelihoodField:
+    if setup.floor_map is not None:
+        return LikelihoodField.from_floor(setup.floor_map)
+    return LikelihoodField.from_walls(setup.walls)
 
 
 def _best_width(count: int) -> float:

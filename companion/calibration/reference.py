@@ -6,9 +6,10 @@ from pathlib import Path
 import numpy as np
 
 from companion.calibration.recording import Recording
-from companion.config import Config, read_text
+from companion.config import Config
 from companion.errors import UserError
 from companion.evaluate import Reference
+from companion.text_file import read_text
 from estimators.geometry import rotation
 from estimators.messages import FloatArray
 

@@ -7,8 +7,9 @@ import tomlkit
 from tomlkit.items import Table
 
 from companion.calibration.ranges import Calibration
-from companion.config import config_from_toml, read_text
+from companion.config import config_from_toml
 from companion.errors import UserError
+from companion.text_file import read_text
 
 
 def write_range_bias(site: Path, calibration: Calibration, to: Path) -> None:
@@ -36,7 +37,7 @@ def write_range_bias(site: Path, calibration: Calibration, to: Path) -> None:
         row["distance"] = round(fit.bias.distance, 3)
         anchors[str(anchor_id)] = row
     text = tomlkit.dumps(document)
-    config_from_toml(text, str(to))
+    config_from_toml(text, str(to), folder=site.parent)
     try:
         to.write_text(text, encoding="utf-8")
     except OSError as error:

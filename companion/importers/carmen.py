@@ -4,11 +4,11 @@ from pathlib import Path
 
 import numpy as np
 
-from companion.config import read_text
 from companion.errors import UserError
 from companion.importers.recording import Recording
 from companion.importers.tables import nanoseconds
 from companion.log import Truth
+from companion.text_file import read_text
 from estimators.messages import FloatArray, Scan
 
 _OLD, _NEW = ("FLASER", "RLASER"), ("ROBOTLASER1", "ROBOTLASER2")

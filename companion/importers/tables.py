@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from companion.config import read_text
 from companion.errors import UserError
 from companion.log import Truth
+from companion.text_file import read_text
 from estimators.messages import FloatArray, RangeFrame
 
 

@@ -3,8 +3,9 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from companion.config import params_dir, read_text
+from companion.config import params_dir
 from companion.errors import UserError
+from companion.text_file import read_text
 
 FOLDERS = {"ardupilot": ".parm", "px4": ".params"}
 """Autopilot -> ending of its files; ours are in a folder of that name."""

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 
-from companion.config import Config, Coordinate, Table, known, load_config, parse_toml, read_text, validated
+from companion.config import Config, Coordinate, Table, known, load_config, parse_toml, validated
 from companion.errors import UserError
 from companion.sim.gait import GaitTrajectory
 from companion.sim.kidnap import Kidnapped, Walk
@@ -27,6 +27,7 @@ from companion.sim.scenario_tables import (
 )
 from companion.sim.trajectory import Trajectory
 from companion.sim.world import World
+from companion.text_file import read_text
 from estimators.messages import FloatArray
 
 

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
+from estimators.geometry import transform
 from estimators.lidar.occupancy_grid import OccupancyGrid
 from estimators.messages import FloatArray
 
@@ -42,6 +43,19 @@ class FloorMap:
             return np.zeros(self.occupied.shape, dtype=np.float32)
         distance = distance_transform_edt(~self.occupied) * self.cell
         return np.exp(-0.5 * (distance / sigma) ** 2).astype(np.float32)
+
+    def obstacle_points(self, spacing: float) -> FloatArray:
+        """Points (N, 2) [m], map frame, spread evenly in every obstacle's cell.
+
+        Args:
+            spacing: of neighbouring points at most [m]; a cell's side or more: the centres alone.
+        """
+        count = max(1, int(np.ceil(self.cell / spacing)))
+        offsets = (np.arange(count) + 0.5) / count
+        within = np.stack(np.meshgrid(offsets, offsets), axis=-1).reshape(-1, 2)
+        rows, columns = np.nonzero(self.occupied)
+        corners = np.column_stack([columns, rows])
+        return transform(self.T_map_grid, self.cell * (corners[:, None] + within).reshape(-1, 2))
 
 
 def floor_map_of(grid: OccupancyGrid) -> FloorMap:

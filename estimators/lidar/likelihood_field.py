@@ -7,12 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
+from estimators.lidar.floor_map import FloorMap
 from estimators.messages import FloatArray, Scan
 
 _CELL = 0.03
 """Resolution of a grid made from walls [m]."""
 _MARGIN = 1.0
-"""How far such a grid reaches beyond its walls [m]."""
+"""How far a grid reaches beyond its obstacles [m]."""
 _BEAMS = 60
 """A scan is weighed by this many of its beams, spread evenly."""
 
@@ -52,17 +53,32 @@ class LikelihoodField:
         Args:
             walls: polylines (N, 2) of at least two corners [m], map frame.
         """
-        corners = np.concatenate(walls)
-        origin = corners.min(axis=0) - _MARGIN
-        columns, rows = np.ceil((corners.max(axis=0) + _MARGIN - origin) / _CELL).astype(int) + 1
+        along = [
+            np.linspace(begin, end, int(np.ceil(2.0 * np.linalg.norm(end - begin) / _CELL)) + 1)
+            for wall in walls
+            for begin, end in pairwise(wall)
+        ]
+        return cls._from_points(np.concatenate(along), _CELL)
+
+    @classmethod
+    def from_floor(cls, floor: FloorMap) -> "LikelihoodField":
+        """Field of a map, with cells as large as the map's but along the axes of the map frame.
+
+        Args:
+            floor: with at least one obstacle.
+        """
+        return cls._from_points(floor.obstacle_points(floor.cell), floor.cell)
+
+    @classmethod
+    def _from_points(cls, points: FloatArray, resolution: float) -> "LikelihoodField":
+        # Whole cells, so that points which lie on a grid of this resolution stay where they are.
+        margin = resolution * np.ceil(_MARGIN / resolution)
+        origin = points.min(axis=0) - margin
+        columns, rows = np.ceil((points.max(axis=0) + margin - origin) / resolution).astype(int) + 1
         occupied = np.zeros((rows, columns), dtype=np.bool_)
-        for wall in walls:
-            for begin, end in pairwise(wall):
-                count = int(np.ceil(2.0 * np.linalg.norm(end - begin) / _CELL)) + 1
-                along = np.linspace(begin, end, count)
-                column, row = np.rint((along - origin) / _CELL).astype(int).T
-                occupied[row, column] = True
-        return cls(occupied, _CELL, origin)
+        column, row = np.rint((points - origin) / resolution).astype(int).T
+        occupied[row, column] = True
+        return cls(occupied, resolution, origin)
 
 
 def beams_of(scan: Scan) -> FloatArray:

@@ -107,6 +107,19 @@ class OccupancyGrid:
         )
         return True
 
+    def occupy(self, points: FloatArray) -> bool:
+        """Take the cells of points (N, 2) [m], map frame, for obstacles that were seen often.
+
+        Returns:
+            False when they were left out: none, or too far apart.
+        """
+        cells = np.floor(points / self._cell)
+        if not len(cells) or not self._grow(cells.min(axis=0), cells.max(axis=0)):
+            return False
+        columns, rows = (cells.astype(np.int64) - self._corner).T
+        self._log_odds[rows, columns] = LIMIT
+        return True
+
     def blocked(self, start: Point, end: Point) -> bool:
         """Whether an obstacle lies on the straight line between two points (x, y) [m], map frame."""
         cell, (column, row) = self._cell, self._corner.tolist()

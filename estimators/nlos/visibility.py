@@ -1,7 +1,7 @@
 """What the LiDAR sees between tag and anchor."""
 
 from collections.abc import Callable
-from math import cos, hypot, log, sin
+from math import cos, hypot, log, sin, sqrt
 
 import numpy as np
 
@@ -23,6 +23,8 @@ MAX_SIGMA_XY, MAX_SIGMA_YAW = 0.2, 0.05
 class Visibility:
     """An occupancy grid of the LiDAR's scans, and rays through it.
 
+    It begins with the obstacles of the site's map, if there is one; scans change them as they do any other.
+
     A planar LiDAR does not see how high an obstacle is. All are taken for equally high; only the part of the
     line below that height can be blocked.
 
@@ -39,8 +41,11 @@ class Visibility:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the grid."""
+        """Forget all scans."""
         self.grid = OccupancyGrid(OccupancyGrid.Config())
+        if self._setup.floor_map is not None:
+            # So near that no cell of the grid is missed, however the map's cells are turned.
+            self.grid.occupy(self._setup.floor_map.obstacle_points(self.grid.cell / sqrt(2.0)))
         self._scan: Scan | None = None
         self._due_ns: int | None = None
 

@@ -7,9 +7,10 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from estimators.base import Report, Settable, Setup, Sketch, Sketched, Verdict
 from estimators.geometry import compose, inverse
-from estimators.messages import FloatArray, Measurement, PoseEstimate, PoseIncrement, RangeFrame
+from estimators.messages import FloatArray, Measurement, PoseEstimate, PoseIncrement, RangeFrame, Scan
 from estimators.range_gate import HorizontalRanges
-from estimators.relocation.search import Minimum, find_pose, lies_outside, too_short, total_loss
+from estimators.relocation.map_search import LEAST_RANGES, MapSearch
+from estimators.relocation.search import Minimum, agreeing, find_pose, lies_outside, too_short, total_loss
 from estimators.relocation.window import PlacedRanges, Window
 
 SHORTER = (1.0, 0.5)
@@ -30,6 +31,8 @@ LOST_YAW_SIGMA = 0.35
 """With less certain a heading than this [rad] a filter is set to what is found without further proof."""
 MOST_TOO_SHORT = 0.1
 """Share of ranges too short for a filter's pose above which it may be wrong: blocked ones are too long."""
+RECENT = 1.0
+"""A place in the map must agree with the ranges of the last so many seconds."""
 OUTSIDE = 0.999
 """Confidence with which a found pose must differ from the filter's."""
 
@@ -41,6 +44,9 @@ class Recovering:
     agree, most of them and along the whole way, on one other pose, clearly not on its own, and some are too
     short for its own: blocked anchors only lengthen ranges, so they do not move a filter that is right. That
     last proof is not asked for while a found pose is younger than the window: it came of less of a way.
+
+    With a map of the site a robot that stands still is looked for by its scan, too. Ranges decide between
+    places that look alike and must agree with the one that is taken.
 
     Args:
         wrapped: the filter.
@@ -80,12 +86,16 @@ class Recovering:
         self._period_ns = round(config.period * 1e9)
         self._starts_known = setup.start.known
         self._window = Window(config.window, HorizontalRanges(range_sigma, setup), setup.tag_in_body)
+        floor = setup.floor_map
+        self._map = MapSearch(floor, range_sigma, setup) if floor is not None else None
         self.reset()
 
     def reset(self) -> None:
         """Forget everything but configuration and setup."""
         self._wrapped.reset()
         self._window.clear()
+        if self._map is not None:
+            self._map.reset()
         self._known = self._starts_known
         self._note = "" if self._known else self._doubt(None)
         self._searched_ns: int | None = None
@@ -99,6 +109,8 @@ class Recovering:
             verdicts = [self._window.add_increment(measurement)]
         else:
             verdicts = [Verdict.NOT_USED]
+        if self._map is not None:
+            _show(self._map, measurement, verdicts)
         report = self._wrapped.update(measurement) if self._known else Report(tuple(verdicts))
         if isinstance(measurement, PoseIncrement) and verdicts == [Verdict.WAITING]:
             self._look_round(measurement.stamp_ns)
@@ -120,7 +132,51 @@ class Recovering:
         estimate = self._wrapped.pose_at(now_ns) if self._known else None
         if estimate is not None and not estimate.cov[5, 5] < LOST_YAW_SIGMA**2:
             estimate = None
-        self._note = self._doubt(estimate)
+        if self._map is None:
+            self._note = self._doubt(estimate)
+        elif self._is_placed(self._map, now_ns, estimate):
+            self._note = ""
+        else:
+            note = self._doubt(estimate)
+            self._note = note and (self._map.flaw or note)
+
+    def _is_placed(self, in_map: MapSearch, now_ns: int, estimate: PoseEstimate | None) -> bool:
+        """Set the filter to where a scan fits the map, if ranges do not speak against it."""
+        recent = self._window.ranges_since(RECENT)
+        if estimate is not None:
+            if recent is None:
+                return False
+            held = self._at_keyframe(np.array([*estimate.xy, estimate.yaw]))
+            if _fits(recent, held) or not self._is_worth_a_search(recent, held, estimate.stamp_ns):
+                return False
+        place = in_map.search(now_ns)
+        if place is None:
+            return False
+        pose = self._at_keyframe(place.pose)
+        lever = np.eye(3)
+        lever[:2, 2] = place.pose[1] - pose[1], pose[0] - place.pose[0]
+        cov = lever @ place.cov @ lever.T
+        if not self._is_certain(cov):
+            in_map.flaw = "position is not sure enough yet"
+            return False
+        if recent is not None:
+            share = agreeing(recent, pose)
+            if share < self._config.min_agreeing or too_short(recent, pose) > MOST_TOO_SHORT:
+                in_map.flaw = f"ranges contradict, {share:.0%} agree"
+                return False
+            if estimate is not None and not _is_better(pose, cov, recent, held, estimate.planar_cov):
+                return False
+        self._set(pose, cov)
+        return True
+
+    def _is_worth_a_search(self, placed: PlacedRanges, held: FloatArray, now_ns: int) -> bool:
+        """Whether a filter's pose (3,) may be wrong: blocked ranges alone are no reason for a long search."""
+        return self._is_young(now_ns) or too_short(placed, held) > MOST_TOO_SHORT
+
+    def _is_certain(self, cov: FloatArray) -> bool:
+        """Whether a found pose with a covariance (3, 3) may be taken."""
+        limit = np.deg2rad(self._config.max_sigma_yaw_deg)
+        return bool(cov[2, 2] <= limit**2 and np.linalg.eigvalsh(cov[:2, :2])[1] <= MOST_SIGMA_XY**2)
 
     def _doubt(self, estimate: PoseEstimate | None) -> str:
         """Set the filter to another pose if ranges speak for one; say what is missing if it has none.
@@ -135,26 +191,24 @@ class Recovering:
                 break
             tried = len(placed.ranges)
             if estimate is not None:
-                held = self._at_keyframe(estimate)
-                if float(total_loss(placed, held[None])[0]) < DOUBTFUL_LOSS * tried:
+                held = self._at_keyframe(np.array([*estimate.xy, estimate.yaw]))
+                if _fits(placed, held):
                     break
-                # A search takes long: blocked ranges alone are no reason for one.
-                if not (self._is_young(estimate.stamp_ns) or too_short(placed, held) > MOST_TOO_SHORT):
+                if not self._is_worth_a_search(placed, held, estimate.stamp_ns):
                     continue
             found, flaw = self._search(placed)
             note = note or flaw
             if found is None:
                 continue
-            if estimate is None or _is_better(found, placed, held, estimate.planar_cov):
-                self._set(found)
+            if estimate is None or _is_better(found.pose, found.cov, placed, held, estimate.planar_cov):
+                self._set(found.pose, found.cov)
                 return ""
         if estimate is not None:
             return ""
         return note or "waiting for increments and ranges"
 
-    def _at_keyframe(self, estimate: PoseEstimate) -> FloatArray:
-        """Where the filter must have been at the newest keyframe, (3,)."""
-        newest = np.array([*estimate.xy, estimate.yaw])
+    def _at_keyframe(self, newest: FloatArray) -> FloatArray:
+        """Where a body that is here now (3,) must have been at the newest keyframe, (3,)."""
         return compose(newest, inverse(self._window.newest_pose))
 
     def _search(self, placed: PlacedRanges) -> tuple[Minimum | None, str]:
@@ -179,10 +233,10 @@ class Recovering:
             return None, "position is not sure enough yet"
         return found, ""
 
-    def _set(self, found: Minimum) -> None:
+    def _set(self, pose: FloatArray, cov: FloatArray) -> None:
         """Put the filter where it should have been at the newest keyframe, and let it follow from there."""
         assert self._window.keyframe_ns is not None
-        self._wrapped.start_at(self._window.keyframe_ns, found.pose, found.cov)
+        self._wrapped.start_at(self._window.keyframe_ns, pose, cov)
         for increment in self._window.since_keyframe:
             self._wrapped.update(increment)
         self._known = True
@@ -197,11 +251,28 @@ def _is_clearly_less(loss: float, other: float) -> bool:
     return other > CLEARLY_LESS * loss + CLEARLY_BELOW
 
 
-def _is_better(found: Minimum, placed: PlacedRanges, held: FloatArray, cov: FloatArray) -> bool:
-    """Whether ranges speak clearly for what was found and against a filter's pose (3,), covariance (3, 3).
+def _fits(placed: PlacedRanges, pose: FloatArray) -> bool:
+    """Whether a pose (3,) of the way's frame explains the ranges well."""
+    return float(total_loss(placed, pose[None])[0]) < DOUBTFUL_LOSS * len(placed.ranges)
+
+
+def _is_better(
+    found: FloatArray, found_cov: FloatArray, placed: PlacedRanges, held: FloatArray, held_cov: FloatArray
+) -> bool:
+    """Whether ranges speak clearly for what was found and against a filter's pose; (3,) and (3, 3).
 
     Two anchors of four that are blocked alike fit a wrong place with a third one better than the right place
     without. But at the right place no range is too short.
     """
-    loss = float(total_loss(placed, held[None])[0])
-    return _is_clearly_less(found.loss, loss) and lies_outside(found.pose, held, found.cov + cov, OUTSIDE)
+    loss, other = total_loss(placed, np.array([found, held])).tolist()
+    return _is_clearly_less(loss, other) and lies_outside(found, held, found_cov + held_cov, OUTSIDE)
+
+
+def _show(in_map: MapSearch, measurement: Measurement, verdicts: list[Verdict]) -> None:
+    """Hand on what a search in the map needs, if it is good for anything."""
+    if isinstance(measurement, Scan):
+        in_map.add_scan(measurement)
+    elif isinstance(measurement, RangeFrame) and verdicts.count(Verdict.WAITING) >= LEAST_RANGES:
+        in_map.add_ranges(measurement)
+    elif isinstance(measurement, PoseIncrement) and verdicts == [Verdict.WAITING]:
+        in_map.add_increment(measurement)

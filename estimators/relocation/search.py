@@ -82,6 +82,12 @@ def too_short(placed: PlacedRanges, pose: FloatArray) -> float:
     return float((residuals < -SHORT_LIMIT).mean())
 
 
+def agreeing(placed: PlacedRanges, pose: FloatArray) -> float:
+    """Share of ranges within `SHORT_LIMIT` sigma if the way's frame stood at a pose (3,)."""
+    residuals, _ = _residuals(placed, pose[None])
+    return float((np.abs(residuals) < SHORT_LIMIT).mean())
+
+
 def find_pose(placed: PlacedRanges, bias_sigma: float) -> Minimum | None:
     """The pose with the least loss.
 

@@ -8,12 +8,12 @@ from scipy.stats import chi2
 
 from companion.config import load_config
 from companion.errors import UserError
-from estimators.base import Verdict
+from estimators.base import Setup, Verdict
 from estimators.geometry import between
 from estimators.messages import FloatArray, ImuSample, PoseIncrement, Scan
 from estimators.particle_filter import ParticleFilter
 from tests.conftest import SITE
-from tests.estimators.lidar.room_scans import ROOM, Loop, scan_while_moving
+from tests.estimators.lidar.room_scans import ROOM, Loop, drawn, scan_while_moving
 from tests.strategies import SETUP
 
 WALLS = [*ROOM]
@@ -31,9 +31,9 @@ SECONDS = 8
 NOW_NS = 10**9
 
 
-def round_the_room(seed: int, **settings: object) -> tuple[FloatArray, FloatArray]:
+def round_the_room(seed: int, setup: Setup = IN_ROOM, **settings: object) -> tuple[FloatArray, FloatArray]:
     """Errors (K, 3) and NEES (K,) of every second on scans and poor increments; no range at all."""
-    pf = ParticleFilter(ParticleFilter.Config.model_validate({"seed": seed, **settings}), IN_ROOM)
+    pf = ParticleFilter(ParticleFilter.Config.model_validate({"seed": seed, **settings}), setup)
     rng = np.random.default_rng(seed)
     truth = LOOP.poses(np.linspace(0.0, SECONDS, 10 * SECONDS + 1))
     errors, nees = [], []
@@ -67,6 +67,12 @@ def test_scans_hold_the_pose_where_it_drifts_without_them() -> None:
     assert drift_rmse > 4.0 * held_rmse
     nees = float(np.mean([values for _, values in held]))
     assert nees < float(chi2.ppf(0.995, 3 * len(runs))) / len(runs)
+
+
+def test_a_map_serves_in_place_of_walls() -> None:
+    on_map = replace(IN_ROOM, walls=[], floor_map=drawn(ROOM, np.array([1.0, -6.0, 0.7])))
+    errors, _ = round_the_room(0, on_map, scan_likelihood=True)
+    assert np.hypot(errors[:, 0], errors[:, 1]).max() < 0.06
 
 
 @pytest.mark.parametrize(

@@ -4,11 +4,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from estimators.geometry import inverse, transform
+from estimators.lidar.floor_map import FloorMap
 from estimators.messages import FloatArray, Scan
 
 BEAMS = 400
 PERIOD = 0.1
 REACH = 12.0
+CELL = 0.05
 
 
 def rectangle(x0: float, y0: float, x1: float, y1: float) -> FloatArray:
@@ -40,6 +43,18 @@ def cast(walls: FloatArray, origins: FloatArray, directions: FloatArray) -> Floa
     hit = (np.abs(det) >= 1e-12) & (t > 0.0) & (s >= 0.0) & (s <= 1.0)
     nearest: FloatArray = np.where(hit, t, np.inf).min(axis=1)
     return np.where(nearest <= REACH, nearest, 0.0)
+
+
+def drawn(walls: FloatArray, T_map_grid: FloatArray) -> FloorMap:
+    """Walls (M, 2, 2) as cells of a grid that may lie askew in the map."""
+    corners = transform(inverse(T_map_grid), walls.reshape(-1, 2)).reshape(-1, 2, 2)
+    share = np.linspace(0.0, 1.0, 2000)[:, None, None]
+    on_wall = (corners[:, 0] + share * (corners[:, 1] - corners[:, 0])).reshape(-1, 2)
+    cells = np.floor(on_wall / CELL).astype(int)
+    assert (cells >= 0).all()
+    occupied = np.zeros(cells.max(axis=0)[::-1] + 3, dtype=bool)
+    occupied[cells[:, 1], cells[:, 0]] = True
+    return FloorMap(occupied, ~occupied, CELL, T_map_grid)
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from estimators.lidar.likelihood_field import LikelihoodField, beams_of
-from estimators.messages import Scan
+from estimators.messages import FloatArray, Scan
+from tests.estimators.lidar.room_scans import CELL, drawn, rectangle
 
 ROOM = np.array([[-1.0, -2.0], [4.0, -2.0], [4.0, 3.0], [-1.0, 3.0], [-1.0, -2.0]])
 
@@ -38,6 +39,27 @@ def test_distances_from_walls_are_right_to_a_cell() -> None:
         assert field.distances[row, column] == pytest.approx(
             min(to_wall, to_room), abs=1.5 * field.resolution
         )
+
+
+@pytest.mark.parametrize("T_map_grid", [np.array([-2.0, -3.0, 0.0]), np.array([1.0, -7.0, 0.7])])
+def test_distances_from_a_map_are_right_to_a_cell_however_it_lies(T_map_grid: FloatArray) -> None:
+    field = LikelihoodField.from_floor(drawn(rectangle(-1.0, -2.0, 4.0, 3.0), T_map_grid))
+    errors = []
+    for x, y in np.random.default_rng(0).uniform([-1.0, -2.0], [4.0, 3.0], (200, 2)):
+        to_room = min(abs(x + 1.0), abs(x - 4.0), abs(y + 2.0), abs(y - 3.0))
+        column, row = np.rint((np.array([x, y]) - field.origin) / field.resolution).astype(int)
+        errors.append(field.distances[row, column] - to_room)
+    assert np.abs(errors).max() < 1.5 * CELL
+    # Half a cell off everywhere would draw every particle aside.
+    assert abs(np.mean(errors)) < 0.5 * CELL
+
+
+def test_cells_of_a_map_along_the_axes_stay_where_they_are() -> None:
+    floor = drawn(rectangle(-1.0, -2.0, 4.0, 3.0), np.array([-2.02, -3.01, 0.0]))
+    field = LikelihoodField.from_floor(floor)
+    rows, columns = np.nonzero(field.distances == 0.0)
+    centres = field.origin + field.resolution * np.column_stack([columns, rows])
+    np.testing.assert_allclose(centres, floor.obstacle_points(CELL), atol=1e-9)
 
 
 def scan(angles: list[float], ranges: list[float]) -> Scan:

@@ -1,6 +1,7 @@
 """What the LiDAR sees between tag and anchor: the grid that is filled on the way, and rays through it."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,10 +9,11 @@ import pytest
 from estimators import estimator_config_class, make_estimator
 from estimators.base import Setup, Start, Verdict
 from estimators.geometry import compose, lift
+from estimators.lidar.floor_map import FloorMap
 from estimators.lidar.occupancy_grid import OccupancyGrid
 from estimators.messages import FloatArray, PoseEstimate, PoseIncrement, Scan
 from estimators.nlos.visibility import OBSTRUCTED, PERIOD_NS, Visibility
-from tests.estimators.lidar.room_scans import PERIOD, ROOM, Arc, Loop, scan_while_moving
+from tests.estimators.lidar.room_scans import PERIOD, ROOM, Arc, Loop, drawn, rectangle, scan_while_moving
 from tests.strategies import range_frame
 
 MOUNTING = np.array([0.1, -0.05, 0.7])
@@ -183,3 +185,41 @@ def test_scans_with_anything_in_them_do_no_harm() -> None:
     show(visibility, Scan(0, empty, empty, empty, empty), known(STANDING))
     assert visibility.log_ratio(POSE, HIDDEN) == OBSTRUCTED
     assert np.isfinite(visibility.grid.log_odds).all()
+
+
+@pytest.mark.parametrize("T_map_grid", [np.zeros(3), np.array([1.0, -6.0, 0.7]), np.array([7.52, 5.03, 3.0])])
+def test_a_map_tells_of_obstacles_before_the_first_scan_and_after_a_reset(T_map_grid: FloatArray) -> None:
+    visibility = Visibility(2.0, replace(SETUP, floor_map=drawn(ROOM, T_map_grid)))
+    for _ in range(2):
+        assert visibility.log_ratio(POSE, HIDDEN) == OBSTRUCTED
+        assert visibility.log_ratio(POSE, FREE) == 0.0
+        visibility.reset()
+
+
+def test_no_ray_slips_between_the_cells_of_a_map_that_lies_askew() -> None:
+    visibility = Visibility(2.0, replace(SETUP, floor_map=drawn(ROOM, np.array([1.0, -6.0, 0.7]))))
+    rng = np.random.default_rng(0)
+    for x, y, yaw in rng.uniform([0.5, 0.5, -3.0], [3.8, 4.0, 3.0], (200, 3)):
+        beyond = np.array([7.0, rng.uniform(0.5, 4.0), 2.1])
+        assert visibility.log_ratio(np.array([x, y, yaw]), beyond) == OBSTRUCTED
+
+
+def test_no_ray_slips_through_cells_larger_than_those_of_the_grid() -> None:
+    wall = FloorMap(np.ones((40, 1), bool), np.zeros((40, 1), bool), 0.2, np.array([4.5, -1.0, 0.2]))
+    visibility = Visibility(2.0, replace(SETUP, floor_map=wall))
+    rng = np.random.default_rng(0)
+    for x, y, yaw in rng.uniform([0.5, 0.5, -3.0], [2.3, 4.0, 3.0], (200, 3)):
+        beyond = np.array([7.0, rng.uniform(0.5, 4.0), 2.1])
+        assert visibility.log_ratio(np.array([x, y, yaw]), beyond) == OBSTRUCTED
+
+
+def test_what_is_gone_since_the_map_was_made_is_forgotten() -> None:
+    visibility = Visibility(2.0, replace(SETUP, floor_map=drawn(ROOM, np.zeros(3))))
+    without_box = rectangle(0.0, 0.0, 6.0, 4.5)
+    for start in np.arange(0.0, 4.0, PERIOD).tolist():
+        show(
+            visibility,
+            scan_while_moving(without_box, STANDING, start, lidar_in_body=MOUNTING),
+            known(STANDING),
+        )
+    assert visibility.log_ratio(POSE, HIDDEN) == 0.0
