@@ -184,6 +184,31 @@ def test_a_lane_tells_what_became_of_most_ranges_of_an_anchor_in_half_a_second(
     assert len(seen) > 1
 
 
+def test_a_lane_shows_the_most_common_reason_though_a_third_is_accepted(run: Run, tmp_path: Path) -> None:
+    kinds = "accepted too_long obstructed accepted too_long too_long".upper().split()
+    verdicts = itertools.cycle(Verdict[kind] for kind in kinds)
+    # The last look of a lane is not as long as the others.
+    late = len(run.ticks) - 1 - len(run.ticks) % 15
+
+    def judge(i: int, tick: Tick, truth: Truth | None) -> tuple[Tick, Truth | None]:
+        outcomes = []
+        for outcome in tick.outcomes:
+            if isinstance(outcome.measurement, RangeFrame):
+                count = len(outcome.measurement.ranges)
+                given = (Verdict.GATED if i > late else next(verdicts),) * count
+                report = replace(outcome.reports["ekf"], verdicts=given)
+                outcome = replace(outcome, reports={**outcome.reports, "ekf": report})
+            outcomes.append(outcome)
+        return replace(tick, outcomes=outcomes), truth
+
+    recording = run.show(tmp_path / "run.rrd", change=judge)
+    assert len(run.ticks) % 15 > 1
+    for i in run.config.anchors:
+        states = [state for (state,) in recording[f"ranges/verdict/A{i}"]["StateChange:state"]]
+        assert states[-2:] == [Verdict.TOO_LONG, Verdict.GATED]
+        assert set(states[:-2]) <= {"no range"}
+
+
 def test_an_anchor_that_is_not_heard_any_more_has_a_lane_that_says_so(run: Run, tmp_path: Path) -> None:
     def without_ranges(i: int, tick: Tick, truth: Truth | None) -> tuple[Tick, Truth | None]:
         outcomes = [o for o in tick.outcomes if i < 150 or not isinstance(o.measurement, RangeFrame)]
