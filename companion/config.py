@@ -76,7 +76,7 @@ class SiteTable(Table):
     map: MapTable | None = Field(
         None,
         description="in a site file the name of a map's YAML file, seen from the site file: it tells blocked "
-        "ranges, serves scan_likelihood, and finds an unknown or lost pose at a standstill (up to 250000 cells)",
+        "ranges, serves scan_likelihood, and up to 250000 cells finds a standing robot",
     )
 
 
