@@ -76,7 +76,7 @@ class SiteTable(Table):
     map: MapTable | None = Field(
         None,
         description="in a site file the name of a map's YAML file, seen from the site file: it tells blocked "
-        "ranges, serves scan_likelihood, and finds an unknown or lost pose at a standstill",
+        "ranges, serves scan_likelihood, and up to 250000 cells finds a standing robot",
     )
 
 
@@ -101,7 +101,9 @@ class StartTable(Table):
     """Where the robot stands when the process starts, and how well that is known."""
 
     known: bool = Field(
-        True, description="false: the robot may stand anywhere, its pose is found once it has moved a metre"
+        True,
+        description="false: the robot may stand anywhere, its pose is found once it has moved a metre, or "
+        "with site.map where it stands",
     )
     x: Coordinate | None = Field(None, description="[m], map frame; needed when the start is known")
     y: Coordinate | None = Field(None, description="likewise")

@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from estimators.lidar.floor_map import FloorMap
 
 MOST_CELLS = 4_000_000
-"""100 m x 100 m in cells of 5 cm: the search in it takes some 100 MB."""
+"""100 m x 100 m in cells of 5 cm: every log holds it, and every start spreads it out in memory."""
 MOST_ACROSS = 200.0
 """Diagonal [m] that the grid of what the LiDAR sees has room for."""
 _OCCUPIED, _FREE = 1, 2

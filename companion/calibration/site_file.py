@@ -37,7 +37,7 @@ def write_range_bias(site: Path, calibration: Calibration, to: Path) -> None:
         row["distance"] = round(fit.bias.distance, 3)
         anchors[str(anchor_id)] = row
     text = tomlkit.dumps(document)
-    config_from_toml(text, str(to), folder=site.parent)
+    config_from_toml(text, str(to), folder=to.parent)
     try:
         to.write_text(text, encoding="utf-8")
     except OSError as error:

@@ -13,6 +13,8 @@ STILL = np.array([0.02, 0.02, 0.02])
 """A robot that moves by less from scan to scan [m, m, rad] stands: nothing of a scan need be put straight."""
 PERIOD_NS = 2_000_000_000
 """A search takes some tenths of a second: no more often."""
+MOST_CELLS = 250_000
+"""25 m x 25 m in cells of 5 cm. In a larger map a search would hold everything else up for seconds."""
 FRESH_NS = 500_000_000
 """Ranges that are older than the scan by more were perhaps measured elsewhere."""
 LEAST_RANGES = 3

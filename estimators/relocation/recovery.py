@@ -9,7 +9,7 @@ from estimators.base import Report, Settable, Setup, Sketch, Sketched, Verdict
 from estimators.geometry import compose, inverse
 from estimators.messages import FloatArray, Measurement, PoseEstimate, PoseIncrement, RangeFrame, Scan
 from estimators.range_gate import HorizontalRanges
-from estimators.relocation.map_search import LEAST_RANGES, MapSearch
+from estimators.relocation.map_search import LEAST_RANGES, MOST_CELLS, MapSearch
 from estimators.relocation.search import Minimum, agreeing, find_pose, lies_outside, too_short, total_loss
 from estimators.relocation.window import PlacedRanges, Window
 
@@ -87,7 +87,9 @@ class Recovering:
         self._starts_known = setup.start.known
         self._window = Window(config.window, HorizontalRanges(range_sigma, setup), setup.tag_in_body)
         floor = setup.floor_map
-        self._map = MapSearch(floor, range_sigma, setup) if floor is not None else None
+        self._map: MapSearch | None = None
+        if floor is not None and floor.occupied.size <= MOST_CELLS:
+            self._map = MapSearch(floor, range_sigma, setup)
         self.reset()
 
     def reset(self) -> None:

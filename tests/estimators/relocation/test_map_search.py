@@ -10,7 +10,7 @@ from estimators import estimator_config_class, make_estimator
 from estimators.base import Estimator, Setup, Start
 from estimators.geometry import between, compose, wrap_angle
 from estimators.messages import FloatArray, Measurement, PoseIncrement, RangeFrame, Scan
-from estimators.relocation.map_search import ALONE_AFTER_NS
+from estimators.relocation.map_search import ALONE_AFTER_NS, MOST_CELLS
 from estimators.relocation.recovery import Recovering
 from tests.estimators.lidar.room_scans import ROOM, Arc, drawn, rectangle, scan_while_moving
 from tests.estimators.matched_world import tag_of
@@ -114,6 +114,15 @@ def test_a_standing_robot_is_found_within_a_second(name: str) -> None:
     notes, now_ns = feed(estimator, stream(ROOM, standing(POSE), 1.0))
     assert_at(estimator, now_ns, POSE)
     assert notes[-1] == ""
+
+
+def test_a_map_too_large_for_a_search_in_time_is_not_searched() -> None:
+    floor = drawn(ROOM, ASKEW)
+    wide = np.pad(floor.occupied, ((0, 0), (0, MOST_CELLS // len(floor.occupied))))
+    estimator = recovering(replace(SETUP, floor_map=replace(floor, occupied=wide, free=~wide)))
+    notes, now_ns = feed(estimator, stream(ROOM, standing(POSE), 1.0))
+    assert estimator.pose_at(now_ns) is None
+    assert notes[-1] == "drive a metre"
 
 
 def test_a_standing_robot_without_ranges_is_found_a_little_later() -> None:
