@@ -56,17 +56,6 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     add_completion=False,
 )
-app.add_typer(doctor, name="doctor")
-app.add_typer(params_app, name="params")
-app.add_typer(calibrate_app, name="calibrate")
-app.command()(sitl)
-app.add_typer(evaluate_app, name="evaluate", cls=_ScenarioUnlessNamed)
-app.command()(smooth)
-app.command()(review)
-app.command("map")(make_map)
-app.command()(edit)
-app.command("import")(import_recording)
-app.command()(export)
 out, err = result_console(), message_console()
 
 Scenario_ = Annotated[
@@ -383,6 +372,20 @@ def dump_config(
         sys.stdout.write(default_toml())
     else:
         sys.stdout.write(load_config(named_file(site, "sites"), sets or []).to_toml())
+
+
+# Help lists commands in this order, after those above.
+app.command()(review)
+app.command()(smooth)
+app.command("map")(make_map)
+app.command()(edit)
+app.command("import")(import_recording)
+app.command()(export)
+app.command()(sitl)
+app.add_typer(doctor, name="doctor")
+app.add_typer(params_app, name="params")
+app.add_typer(calibrate_app, name="calibrate")
+app.add_typer(evaluate_app, name="evaluate", cls=_ScenarioUnlessNamed)
 
 
 def main() -> NoReturn:
