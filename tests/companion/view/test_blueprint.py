@@ -23,4 +23,5 @@ def test_two_runs_are_compared_on_the_scale_of_the_larger(config: Config) -> Non
     plots = [view for view in views if isinstance(view, rrb.TimeSeriesView)]
     assert [view.origin for view in plots] == ["before/error/position", "after/error/position"]
     for view in plots:
-        assert view.properties["ScalarAxis"].range.as_arrow_array().to_pylist() == [[0.0, 0.4]]
+        axis: Any = view.properties["ScalarAxis"]
+        assert axis.range.as_arrow_array().to_pylist() == [[0.0, 0.4]]
