@@ -1,6 +1,7 @@
 """The commands. Data goes to files or stdout, progress and messages to stderr."""
 
 import logging
+import os
 import signal
 import sys
 import threading
@@ -217,6 +218,8 @@ def emulate(scenario: Scenario_, seed: Seed = None, view: View = "off", sets: Se
     shown = None
     try:
         if where != "off":
+            # Rerun would tell of every viewer that was closed.
+            os.environ.setdefault("RUST_LOG", "off")
             from companion.view.walk_view import WalkView
 
             shown = WalkView(emulator.robot, where, lambda line: err.print(line, soft_wrap=True))

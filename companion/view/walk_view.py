@@ -13,7 +13,7 @@ from companion.view.entities import Entities
 from companion.view.map_scene import ARROW
 from companion.view.palette import GREEN, GREY, ORANGE, VERMILION, WHITE, rgba, screen
 from companion.view.viewer import Mode, Viewer
-from companion.view.window import Window
+from companion.view.window import KEEPS_UP, Window
 from estimators.geometry import transform
 
 PERIOD = 0.1
@@ -104,7 +104,8 @@ class WalkView:
     def close(self) -> None:
         """End the view."""
         self._closing.set()
-        self._thread.join()
+        # Not for ever: a viewer that dies in the middle may leave it waiting.
+        self._thread.join(2.0 * KEEPS_UP)
         self._window.close()
 
     def _run(self) -> None:

@@ -48,7 +48,7 @@ class Window:
 
     def close(self) -> None:
         """End a page; a window stays until it is closed, unless it has stalled."""
-        if self.take() and not self._viewer.is_page:
+        if self.is_open and self.take() and not self._viewer.is_page:
             self.stream.disconnect()
         else:
             # First the viewer: a stream that waits for it would never end.
