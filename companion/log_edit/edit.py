@@ -11,7 +11,7 @@ from companion.config import Config
 from companion.errors import UserError
 from companion.evaluate import Reference
 from companion.log import Direction, Log, LogWriter, RawChunk, Truth
-from companion.log_edit.faults import ChunkFault, Fault, FrameFault, ScanFault, TagPosition
+from companion.log_edit.faults import ChunkFault, Fault, FrameFault, ScanFault, Scene, TagPosition
 from companion.raw_scans import ScanEncoder
 from drivers import make_sensor
 from drivers.linktrack import LinkTrack
@@ -110,11 +110,12 @@ def _with_frames(
             continue
         assert isinstance(record, RawChunk)
         data = b""
+        scene = Scene(record.stamp_ns, tag_at, config, rng)
         for whole in decoder.frames(record.data):
             frame = whole
             for fault in faults:
                 if fault.active((record.stamp_ns - start_ns) * 1e-9):
-                    frame = fault.edit_frame(frame, record.stamp_ns, tag_at, config, rng)
+                    frame = fault.edit_frame(frame, scene)
             data += encode(frame)
         if data:
             out.append(replace(record, data=data))

@@ -4,7 +4,7 @@ On the command line a fault is KIND:key=value,key=value, for example `drop:ancho
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from math import inf
 from typing import Annotated, ClassVar
 
@@ -56,22 +56,34 @@ class ChunkFault(Fault):
         raise NotImplementedError
 
 
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """What there was when a frame arrived.
+
+    Attributes:
+        stamp_ns: its arrival.
+        tag_at: true position of the tag; asked for by faults that need the truth alone.
+        config: of the site.
+        rng: source of all that is random.
+    """
+
+    stamp_ns: int
+    tag_at: TagPosition
+    config: Config
+    rng: np.random.Generator
+
+
 class FrameFault(Fault):
     """Changes frames of a LinkTrack module."""
 
     NEEDS_TRUTH: ClassVar[bool] = False
 
-    def edit_frame(
-        self, frame: Frame, stamp_ns: int, tag_at: TagPosition, config: Config, rng: np.random.Generator
-    ) -> Frame:
+    def edit_frame(self, frame: Frame, scene: Scene) -> Frame:
         """The frame as it would have been.
 
         Args:
             frame: as it was.
-            stamp_ns: its arrival.
-            tag_at: true position of the tag; asked for by faults that need the truth alone.
-            config: of the site.
-            rng: source of all that is random.
+            scene: in which it was sent.
         """
         raise NotImplementedError
 
@@ -112,11 +124,9 @@ class Drop(FrameFault):
 
     anchor: int
 
-    def edit_frame(
-        self, frame: Frame, stamp_ns: int, tag_at: TagPosition, config: Config, rng: np.random.Generator
-    ) -> Frame:
+    def edit_frame(self, frame: Frame, scene: Scene) -> Frame:
         """See `FrameFault`."""
-        del stamp_ns, tag_at, config, rng
+        del scene
         return change_ranges(frame, lambda anchor, dis: None if anchor == self.anchor else Changed(dis))
 
 
@@ -127,15 +137,12 @@ class Spike(FrameFault):
     size: float = Field(3.0, gt=0, le=1000, description="standard deviation [m]")
     share: float = Field(0.1, gt=0, le=1, description="of ranges that are hit")
 
-    def edit_frame(
-        self, frame: Frame, stamp_ns: int, tag_at: TagPosition, config: Config, rng: np.random.Generator
-    ) -> Frame:
+    def edit_frame(self, frame: Frame, scene: Scene) -> Frame:
         """See `FrameFault`."""
-        del stamp_ns, tag_at, config
 
         def change(anchor: int, dis: float) -> Changed:
-            hit = self.anchor in (None, anchor) and rng.random() < self.share
-            return Changed(dis + self.size * rng.standard_normal() if hit else dis)
+            hit = self.anchor in (None, anchor) and scene.rng.random() < self.share
+            return Changed(dis + self.size * scene.rng.standard_normal() if hit else dis)
 
         return change_ranges(frame, change)
 
@@ -147,16 +154,13 @@ class Nlos(FrameFault):
     least: float = Field(0.2, ge=0, le=100, description="least bias [m]")
     mean: float = Field(0.3, ge=0, le=100, description="mean of the exponential bias on top of that [m]")
 
-    def edit_frame(
-        self, frame: Frame, stamp_ns: int, tag_at: TagPosition, config: Config, rng: np.random.Generator
-    ) -> Frame:
+    def edit_frame(self, frame: Frame, scene: Scene) -> Frame:
         """See `FrameFault`."""
-        del stamp_ns, tag_at, config
 
         def change(anchor: int, dis: float) -> Changed:
             if self.anchor not in (None, anchor):
                 return Changed(dis)
-            return Changed(dis + self.least + rng.exponential(self.mean), _NLOS_RX_LOSS, _NLOS_FP_LOSS)
+            return Changed(dis + self.least + scene.rng.exponential(self.mean), _NLOS_RX_LOSS, _NLOS_FP_LOSS)
 
         return change_ranges(frame, change)
 
@@ -170,12 +174,9 @@ class Moved(FrameFault):
     y: Coordinate = Field(0.0, description="along y [m]")
     z: Coordinate = Field(0.0, description="upwards [m]")
 
-    def edit_frame(
-        self, frame: Frame, stamp_ns: int, tag_at: TagPosition, config: Config, rng: np.random.Generator
-    ) -> Frame:
+    def edit_frame(self, frame: Frame, scene: Scene) -> Frame:
         """See `FrameFault`."""
-        del rng
-        offset = np.array(config.anchors[self.anchor]) - tag_at(stamp_ns)
+        offset = np.array(scene.config.anchors[self.anchor]) - scene.tag_at(scene.stamp_ns)
         longer = float(np.linalg.norm(offset + np.array([self.x, self.y, self.z])) - np.linalg.norm(offset))
         return change_ranges(
             frame, lambda anchor, dis: Changed(dis + longer if anchor == self.anchor else dis)
@@ -187,11 +188,9 @@ class Clock(FrameFault):
 
     by: float = Field(ge=-86400, le=86400, description="[s]")
 
-    def edit_frame(
-        self, frame: Frame, stamp_ns: int, tag_at: TagPosition, config: Config, rng: np.random.Generator
-    ) -> Frame:
+    def edit_frame(self, frame: Frame, scene: Scene) -> Frame:
         """See `FrameFault`."""
-        del stamp_ns, tag_at, config, rng
+        del scene
         if not isinstance(frame, Sender):
             return frame
         return replace(frame, local_time_ms=(frame.local_time_ms + round(self.by * 1000)) % 2**32)
@@ -202,11 +201,9 @@ class Rotated(FrameFault):
 
     yaw_deg: float = Field(90.0, ge=-360, le=360, description="counter-clockwise [deg]")
 
-    def edit_frame(
-        self, frame: Frame, stamp_ns: int, tag_at: TagPosition, config: Config, rng: np.random.Generator
-    ) -> Frame:
+    def edit_frame(self, frame: Frame, scene: Scene) -> Frame:
         """See `FrameFault`."""
-        del stamp_ns, tag_at, config, rng
+        del scene
         if not isinstance(frame, TagState):
             return frame
         yaw = float(np.deg2rad(self.yaw_deg))
