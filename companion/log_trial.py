@@ -10,10 +10,9 @@ from companion.config import Config
 from companion.errors import UserError
 from companion.evaluate import Reference, compare
 from companion.log import Log, RawChunk, Truth
-from companion.pipeline import Chain, make_monitor, make_sensors
+from companion.pipeline import Chain
 from companion.replay import config_of
-from companion.trial import TrialFigures, make_choice, trial_figures, watched_pipeline
-from companion.watched import WatchedEstimator
+from companion.trial import TrialFigures, note_poses, trial_figures, watched_choices, watched_pipeline
 from estimators.messages import PoseEstimate
 
 LOG_SUFFIX = ".mcap"
@@ -80,12 +79,7 @@ def run_records(
     setup = config.setup()
     begin_ns = max(start_ns, truths[0].stamp_ns)
     start = reference.at([begin_ns])[0] if np.isfinite(truths[0].pose[2]) else setup.start.pose
-    watched = {
-        choice: WatchedEstimator(
-            make_choice(config, setup, choice, start), make_monitor(config, make_sensors(config))
-        )
-        for choice in choices
-    }
+    watched = watched_choices(config, setup, choices, start)
     chain = Chain(config, start_ns, watched_pipeline(config, watched), next(iter(watched)))
     poses: dict[str, list[PoseEstimate]] = {choice: [] for choice in choices}
     instants: list[int] = []
@@ -94,9 +88,7 @@ def run_records(
             continue
         for tick in chain.feed(record):
             instants.append(tick.stamp_ns)
-            for choice, pose in tick.poses.items():
-                if pose is not None:
-                    poses[choice].append(pose)
+            note_poses(tick.poses, poses)
     covered = sum(reference.covers(stamp_ns) for stamp_ns in instants)
     return {
         choice: trial_figures(

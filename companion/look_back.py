@@ -27,10 +27,10 @@ class LookBack:
         """Look whether the robot is back at a place.
 
         Args:
-            increment: the newest.
+            increment: the newest; a keyframe.
             pose: what an estimator, which has taken the increment, makes of its instant.
         """
-        if not increment.is_keyframe or pose is None or not np.isfinite(pose.planar_cov).all():
+        if pose is None or not np.isfinite(pose.planar_cov).all():
             return None
         matcher = self._matcher
         if matcher.keyframe_ns != increment.stamp_ns:

@@ -104,7 +104,7 @@ class Pipeline:
         return outcomes
 
     def _closure(self, increment: PoseIncrement) -> LoopClosure | None:
-        if self._look_back is None:
+        if self._look_back is None or not increment.is_keyframe:
             return None
         guide = next(iter(self._estimators.values()))
         return self._look_back.update(increment, guide.pose_at(increment.stamp_ns))

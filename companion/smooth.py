@@ -131,16 +131,8 @@ def _interpolated(log: Log, poses: Sequence[PoseEstimate]) -> Callable[[IntArray
     """Poses (K, 3) of a track at any instants (K,)."""
     if not poses:
         raise UserError(f"{log.path}: cannot be smoothed: its estimator gives no pose to begin at")
-    stamps_ns = np.array([pose.stamp_ns for pose in poses], dtype=np.int64)
-    known = np.array([[*pose.xy, pose.yaw] for pose in poses])
-    known[:, 2] = np.unwrap(known[:, 2])
-
-    def at(instants_ns: IntArray) -> FloatArray:
-        times = (instants_ns - stamps_ns[0]).astype(np.float64)
-        at_poses = (stamps_ns - stamps_ns[0]).astype(np.float64)
-        return np.column_stack([np.interp(times, at_poses, column) for column in known.T])
-
-    return at
+    track = Reference([Truth(pose.stamp_ns, np.array([*pose.xy, pose.yaw])) for pose in poses])
+    return lambda instants_ns: track.at(instants_ns.tolist())
 
 
 def _pose_estimates(smoothed: Smoothed, setup: Setup) -> list[PoseEstimate]:

@@ -1,6 +1,6 @@
 """One trial of a scenario: estimators side by side on the same measurements, and how far each was off."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -133,13 +133,7 @@ def run_trial(
     scenario = load_scenario(path, seed, sets)
     setup = setup_of(scenario)
     start = scenario.trajectory.at(np.zeros(1)).pose[0]
-    watched = {
-        choice: WatchedEstimator(
-            make_choice(scenario.config, setup, choice, start),
-            make_monitor(scenario.config, make_sensors(scenario.config)),
-        )
-        for choice in choices
-    }
+    watched = watched_choices(scenario.config, setup, choices, start)
     poses: dict[str, list[PoseEstimate]] = {choice: [] for choice in choices}
     bound: float | None = None
     excess = TrueExcess(1.0 / scenario.file.uwb.rate)
@@ -173,18 +167,29 @@ def run_trial(
     return found
 
 
-def make_choice(config: Config, setup: Setup, choice: str, start: FloatArray) -> Estimator:
-    """Estimator or single sensor that a choice names.
+def watched_choices(
+    config: Config, setup: Setup, choices: Iterable[str], start: FloatArray
+) -> dict[str, WatchedEstimator]:
+    """Estimators and single sensors that choices name, each watched by a monitor of its own.
 
     Args:
         config: of the site.
         setup: its geometry.
-        choice: NAME[:PARAM].
+        choices: NAME[:PARAM].
         start: (3,) true x [m], y [m], yaw [rad] at the start, from which `lidar` counts.
 
     Raises:
-        UserError: the parameter is wrong.
+        UserError: a parameter is wrong.
     """
+    sensors = make_sensors(config)
+    return {
+        choice: WatchedEstimator(make_choice(config, setup, choice, start), make_monitor(config, sensors))
+        for choice in choices
+    }
+
+
+def make_choice(config: Config, setup: Setup, choice: str, start: FloatArray) -> Estimator:
+    """Estimator or single sensor that a choice names; see `watched_choices`."""
     if choice == LIDAR_ALONE:
         return DeadReckoning(setup, start)
     if choice == UWB_ALONE:
@@ -213,7 +218,7 @@ def _step_through(
             reports = {choice: estimator.update(following) for choice, estimator in estimators.items()}
             outcomes.append(Outcome(following, reports))
             following = next(waiting, None)
-        _note({label: estimator.pose_at(stamp_ns) for label, estimator in estimators.items()}, poses)
+        note_poses({label: estimator.pose_at(stamp_ns) for label, estimator in estimators.items()}, poses)
     truths = [Truth(stamp_ns, pose) for stamp_ns, pose in zip(instants, walk.poses, strict=True)]
     return truths, instants, outcomes
 
@@ -238,7 +243,7 @@ def _run_chain(
         for tick in chain.feed(item):
             instants.append(tick.stamp_ns)
             outcomes += tick.outcomes
-            _note(tick.poses, poses)
+            note_poses(tick.poses, poses)
     return truths, instants, outcomes
 
 
@@ -254,7 +259,8 @@ def _scores(
     return scores
 
 
-def _note(now: Mapping[str, PoseEstimate | None], poses: Mapping[str, list[PoseEstimate]]) -> None:
+def note_poses(now: Mapping[str, PoseEstimate | None], poses: Mapping[str, list[PoseEstimate]]) -> None:
+    """Add the poses of an instant to those before, by choice; who has none adds none."""
     for choice, pose in now.items():
         if pose is not None:
             poses[choice].append(pose)

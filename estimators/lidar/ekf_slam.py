@@ -14,17 +14,13 @@ from estimators.geometry import inverse, transform, transform_each
 from estimators.lidar.feature_association import NEW, NONE, Matches, match_spots, match_walls, unite_doubles
 from estimators.lidar.feature_map import FeatureMap, Kind
 from estimators.lidar.features import Features, find_features
-from estimators.lidar.scan_fit import LEAST_INFORMATION
-from estimators.lidar.scan_preparation import PreparedScan, ScanPreparation
+from estimators.lidar.scan_fit import LEAST_INFORMATION, UNKNOWN_SPEED_SIGMA
+from estimators.lidar.scan_preparation import LEAST_GAP_NS, PreparedScan, ScanPreparation
 from estimators.lidar.sightings import STATES, Rows, SpotSightings, WallSightings
 from estimators.messages import FloatArray, IntArray, Measurement, PoseIncrement, Scan
 from estimators.models.motion import constant_velocity, cubic_between, smooth_motion
 from estimators.models.motion_settings import MotionInScans
 
-UNKNOWN_SPEED_SIGMA = 1.0
-"""Standard deviation of each velocity [m/s, rad/s] before anything was matched."""
-LEAST_GAP_NS = 1_000_000
-"""A scan that ends sooner after the one before is none that a scanner makes."""
 LOST_SIGMA = np.array([1.0, 0.35])
 """With a prediction less certain than this [m] in every direction, or than this in yaw [rad], features are
 not told apart and linearising means nothing."""

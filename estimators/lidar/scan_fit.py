@@ -16,6 +16,8 @@ HELD_RATIO = 5.0
 """Walls hold a direction when a scan says so many times more of it than noise of the normals feigns."""
 LEAST_INFORMATION = 1.0
 """Information [1/m^2, 1/rad^2] that every direction has: what nothing observes comes out with sigma 1."""
+UNKNOWN_SPEED_SIGMA = 1.0
+"""Standard deviation of each velocity [m/s, rad/s] before a scan was matched."""
 LEAST_MATCHED = 10
 """With fewer matched points there is no match."""
 CONVERGED = 1e-4

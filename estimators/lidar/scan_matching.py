@@ -17,18 +17,14 @@ from pydantic import Field
 from estimators.geometry import inverse, rotation, transform, transform_each
 from estimators.lidar.expectation import MotionNoise, expect
 from estimators.lidar.known_motion import GyroTrack, OdometryTrack
-from estimators.lidar.scan_fit import NEWEST, said_by_scan, search_start, settle
-from estimators.lidar.scan_preparation import PreparedScan, ScanPreparation
+from estimators.lidar.scan_fit import NEWEST, UNKNOWN_SPEED_SIGMA, said_by_scan, search_start, settle
+from estimators.lidar.scan_preparation import LEAST_GAP_NS, PreparedScan, ScanPreparation
 from estimators.messages import FloatArray, ImuSample, Measurement, PoseIncrement, Scan
 from estimators.models.motion_settings import MotionInScans
 
 if TYPE_CHECKING:
     from estimators.lidar.line_map import LineMap, Surface
 
-UNKNOWN_SPEED_SIGMA = 1.0
-"""Standard deviation of each velocity [m/s, rad/s] before the first match."""
-LEAST_GAP_NS = 1_000_000
-"""A scan that ends sooner after the one before is none that a scanner makes."""
 KEYFRAME_SHARE = 0.7
 """When a smaller share of the surface points is matched, too little of the keyframe is still in view."""
 

@@ -8,6 +8,8 @@ from pydantic import BaseModel, ConfigDict, Field
 from estimators.geometry import transform
 from estimators.messages import Attitude, FloatArray, Measurement, Scan
 
+LEAST_GAP_NS = 1_000_000
+"""A scan that ends sooner after the one before is none that a scanner makes."""
 MOST_ATTITUDE_AGE = 0.2
 """An older attitude [s] levels no scan."""
 
