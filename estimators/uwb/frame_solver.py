@@ -5,10 +5,11 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from estimators.base import Report, Setup, Verdict
 from estimators.geometry import lift
+from estimators.least_squares import LeastSquares
 from estimators.messages import FloatArray, Measurement, PoseEstimate, RangeFrame
 from estimators.models.range import reduce_height
 from estimators.trilateration import AnchorGeometryError, check_anchor_geometry
@@ -63,18 +64,12 @@ class FrameSolver(ABC):
     covariance: a-posteriori variance factor of least squares.
     """
 
-    class Config(BaseModel):
+    class Config(LeastSquares.Config):
         """Settings of every solver of frames."""
 
-        model_config = ConfigDict(extra="forbid", frozen=True)
         PARAMETER: ClassVar[str] = "dimensions"
 
         dimensions: int = Field(2, ge=2, le=3, description="2: at the site's height; 3: height from ranges")
-        range_sigma: float = Field(0.10, gt=0, le=10, description="standard deviation of a range [m]")
-        max_age: float = Field(0.5, gt=0, le=10, description="a fix older than this is no pose [s]")
-        speed_sigma: float = Field(
-            0.5, ge=0, le=20, description="unknown motion since the fix, as a speed [m/s]"
-        )
 
     def __init__(self, config: Config, setup: Setup) -> None:
         self._config = config
