@@ -4,6 +4,7 @@ With odometry from outside the states are those of its drift: seen from a body t
 says, the robot stands still but for the odometry's error. With a gyroscope this holds of the heading alone.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,8 +17,10 @@ from estimators.models.motion import cubic_between, smooth_motion
 
 _LEAST_VARIANCE = 1e-8
 """Of what odometry says [m^2, rad^2]."""
-_MODES = np.pi * np.arange(1, 7)
-"""Of a Brownian bridge, that are looked at; what is left out has a seventh of its variance."""
+_WAVES = np.pi * np.arange(1, 7)
+"""Wave numbers of a Brownian bridge's modes; what is left out has a seventh of its variance."""
+_CLAMPED_WAVES = np.array([4.730040745, 7.853204624, 10.995607838, 14.137165491])
+"""Of a bar clamped at both ends; what is left out has a hundredth of the variance."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -32,7 +35,9 @@ class Expectation:
         F: (6, 6) transition from there to the end of this scan.
         Q: (6, 6) its noise.
         twist: (3,) known velocity at the end, body frame; the states' comes on top of it.
-        drift: (3, 3) covariance of what the known motion errs by from end to end.
+        deviation: (3, 3) covariance of what `modes` are multiples of.
+        modes: how motion between the states deviates from the one that is assumed: (K, M) for shares (M,) of
+            the time from the scan before.
     """
 
     points: FloatArray
@@ -42,28 +47,41 @@ class Expectation:
     F: FloatArray
     Q: FloatArray
     twist: FloatArray
-    drift: FloatArray
+    deviation: FloatArray
+    modes: Callable[[FloatArray], FloatArray]
 
     def bent(self, shares: FloatArray, by_pose: FloatArray) -> FloatArray:
-        """Covariance (3, 3) that the pose at the end has because the known motion's own errors bend the scan.
+        """Covariance (3, 3) that the pose at the end has because motion between the states bends the scan.
 
-        The drift is a random walk and is taken for straight; from there it deviates as a Brownian bridge,
-        whose modes are sines. Each of them moves the beams, and by them the pose that fits best.
+        Each mode moves the beams, and by them the pose that fits best.
 
         Args:
             shares: (M,) of the way in time from the scan before, of the beams that are matched.
             by_pose: (M, 3) change of each beam's distance from its line with the pose at its instant.
         """
-        if not self.drift.any():
-            return self.drift
         by_end = shares[:, None] * by_pose
         hessian = by_end.T @ by_end + _LEAST_VARIANCE * np.eye(3)
-        cov = np.zeros((3, 3))
-        for mode in _MODES:
-            pull = by_end.T @ ((np.sqrt(2.0) / mode * np.sin(mode * shares))[:, None] * by_pose)
-            gain = np.linalg.solve(hessian, pull)
-            cov += gain @ self.drift @ gain.T
+        pulls = by_end.T @ (self.modes(shares)[:, :, None] * by_pose)
+        gains = np.linalg.solve(hessian, pulls)
+        cov: FloatArray = (gains @ self.deviation @ gains.transpose(0, 2, 1)).sum(axis=0)
         return cov
+
+
+def bridge(shares: FloatArray) -> FloatArray:
+    """Modes (6, M) by which a random walk of unit variance deviates from a straight line."""
+    phases: FloatArray = np.outer(_WAVES, shares)
+    modes: FloatArray = np.sqrt(2.0) * np.sin(phases) / _WAVES[:, None]
+    return modes
+
+
+def clamped_bar(shares: FloatArray) -> FloatArray:
+    """Modes (4, M) by which motion under white acceleration deviates from a cubic, of unit power."""
+    waves = _CLAMPED_WAVES[:, None]
+    ratio = (np.cosh(waves) - np.cos(waves)) / (np.sinh(waves) - np.sin(waves))
+    phases = waves * np.clip(shares, 0.0, 1.0)
+    shape = np.cosh(phases) - np.cos(phases) - ratio * (np.sinh(phases) - np.sin(phases))
+    modes: FloatArray = shape / waves**2
+    return modes
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,12 +145,22 @@ def expect(
             F,
             Q,
             twist,
-            np.zeros((3, 3)),
+            _sway(Q, dt),
+            clamped_bar,
         )
     F, Q = smooth_motion(dt, noise.accel, noise.yaw_accel, noise.bandwidth)
     return Expectation(
-        scan.points, cubic_between(shares, dt), state, cov, F, Q, np.zeros(3), np.zeros((3, 3))
+        scan.points, cubic_between(shares, dt), state, cov, F, Q, np.zeros(3), _sway(Q, dt), clamped_bar
     )
+
+
+def _sway(Q: FloatArray, dt: float) -> FloatArray:
+    """Covariance (3, 3) that the modes of `clamped_bar` have under `smooth_motion`.
+
+    Of the noise of a step's way a quarter comes from its final velocity; the rest is what the body sways.
+    """
+    sway: FloatArray = 12.0 * (Q[:3, :3] - 0.25 * dt * dt * Q[3:, 3:])
+    return sway
 
 
 def _along_odometry(
@@ -170,4 +198,5 @@ def _along_odometry(
         Q,
         odometry.twist(),
         drift,
+        bridge,
     )

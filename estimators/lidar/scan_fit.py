@@ -116,6 +116,7 @@ def settle(
     predicted: FloatArray,
     start: FloatArray,
     sigma: float,
+    spread: float,
 ) -> Fit | None:
     """Minimise the distances of surface points from their lines and the deviation from the prediction.
 
@@ -127,9 +128,12 @@ def settle(
         predicted: (12,) states beforehand.
         start: (12,) states to begin with.
         sigma: least standard deviation of a distance [m].
+        spread: how far points may be off at the start [m]; at first nothing nearer is taken for an outlier.
 
     Returns:
         The fit; None when hardly a point is near a line.
+
+    Source: Yang et al., "Graduated non-convexity for robust spatial perception", RA-L 2020, for the spread.
     """
     states = start
     for _ in range(MOST_ITERATIONS):
@@ -140,7 +144,7 @@ def settle(
         # Cauchy weight; its scale is the noise of two scans, or what the distances say when larger.
         middle = len(distances) // 2
         scale = max(2.0 * sigma, 1.5 * float(np.partition(distances, middle)[middle]))
-        sums = keyframe.sums(basis, rows, index, scale)
+        sums = keyframe.sums(basis, rows, index, max(scale, spread))
         held = held_directions(sums.pose_hessian, sums.feigned)
         of_all = np.zeros((12, 12))
         for k in range(0, 12, 3):
@@ -152,8 +156,9 @@ def settle(
         # What nothing holds goes on as predicted; else the least doubt of its direction would move it.
         step = of_all @ np.linalg.solve(information, -gradient)
         states = states + step
-        if float(np.abs(step[NEWEST]).max()) < CONVERGED:
+        if float(np.abs(step[NEWEST]).max()) < CONVERGED and spread <= scale:
             break
+        spread *= 0.5
     gain = np.linalg.pinv(held @ sums.pose_hessian @ held, rcond=1e-9, hermitian=True)
     keyframe_cov = variance * gain @ keyframe.gradient_noise(sums.by_line) @ gain
     return Fit(states, information, held, keyframe_cov, len(distances) / len(found.points))

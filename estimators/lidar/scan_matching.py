@@ -217,7 +217,10 @@ class ScanMatcher:
         predicted = np.concatenate([expected.state, F @ expected.state])
         doubt = np.sqrt(np.diag(F @ expected.cov @ F.T + Q)[:3])
         start = search_start(keyframe, found, basis, predicted, doubt, dt, config.max_correspondence)
-        fit = settle(keyframe, found, basis, prior, predicted, start, self._ranges_to_walls(found))
+        far = np.hypot(found.points[:, 0], found.points[:, 1]).mean() if len(found.points) else 0.0
+        spread = min(2.0 * float(max(doubt[0], doubt[1], doubt[2] * far)), config.max_correspondence)
+        sigma = self._ranges_to_walls(found)
+        fit = settle(keyframe, found, basis, prior, predicted, start, sigma, spread)
         if fit is None:
             return None
         # A bare wall looks the same everywhere: after a long gap it is only known to be one when all fits.
