@@ -6,7 +6,6 @@ import numpy as np
 
 from companion.evaluate import Errors
 from companion.sim.scenario import Scenario
-from companion.sim.simulate import START_NS
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,17 +21,19 @@ class LegFigures:
     max_m: float
 
 
-def leg_figures(scenario: Scenario, errors: Errors) -> dict[str, LegFigures]:
+def leg_figures(scenario: Scenario, errors: Errors, end_ns: int) -> dict[str, LegFigures]:
     """Figures by the names that the scenario gives its legs, if any; legs without a pose are left out.
 
     Args:
-        scenario: without bytes, so that its walk begins at `START_NS`.
+        scenario: that was run.
         errors: of one estimator.
+        end_ns: when the walk was over.
     """
     names = scenario.file.trajectory.leg_names
     if not names:
         return {}
-    times = (errors.stamps_ns - START_NS) * 1e-9
+    # It ends with the walk, and began when the LiDAR was ready.
+    times = (errors.stamps_ns - end_ns) * 1e-9 + scenario.trajectory.duration
     figures: dict[str, LegFigures] = {}
     for name, (begin, end) in zip(names, scenario.trajectory.legs, strict=True):
         distance = errors.distance[(times >= begin) & (times <= end)]

@@ -162,7 +162,7 @@ def run_trial(
             epoch_bound=epoch_bound,
             sought_ns=sought_ns,
             ranges=scores[choice],
-            legs=leg_figures(scenario, errors),
+            legs=leg_figures(scenario, errors, truths[-1].stamp_ns),
         )
     return found
 

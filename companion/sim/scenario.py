@@ -171,12 +171,6 @@ class ScenarioFile(Table):
     inertial: InertialTable | None = None
     paper: PaperTable | None = None
 
-    @model_validator(mode="after")
-    def _legs_without_bytes(self) -> Self:
-        if self.trajectory.leg_names and self.increments is None:
-            raise ValueError("trajectory.leg_names: figures for legs need a table [increments]")
-        return self
-
     @field_validator("landmarks")
     @classmethod
     def _without_bytes(cls, landmarks: LandmarksTable, info: ValidationInfo) -> LandmarksTable:

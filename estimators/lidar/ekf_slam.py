@@ -5,6 +5,7 @@ is taken from where the body is at the beam's own instant, as in scan matching. 
 say: the motion model's share is taken out again, and a direction that no feature holds comes out wide.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -140,6 +141,7 @@ class EkfSlam:
             self.refused += 1
             self.map = None
             return self._begin(scan)
+        matches = look.reconciled(here, matches)
         look.correct(here, matches)
         increment, cov = here.pose.copy(), _said_by_scan(expected, here.pose_cov)
         # A late stamp does nothing to a motion that goes on as it was at the keyframe.
@@ -227,8 +229,24 @@ class _Look:
             return float(self._walls.size[matches[Kind.WALL].known].sum() / self._walls.size.sum())
         return float(np.concatenate([matches[kind].known for kind in self._spots]).mean())
 
+    def reconciled(self, here: FeatureMap, matches: dict[Kind, Matches]) -> dict[Kind, Matches]:
+        """Associations that fit together; what does not fit is taken for new."""
+        while any((of_kind.feature >= 0).any() for of_kind in matches.values()):
+            misfit = here.misfit(self._rows(here, matches)())
+            if misfit is None:
+                break
+            matches = {
+                kind: replace(of_kind, feature=np.where(of_kind.feature == misfit, NEW, of_kind.feature))
+                for kind, of_kind in matches.items()
+            }
+        return matches
+
     def correct(self, here: FeatureMap, matches: dict[Kind, Matches]) -> None:
         """Stages 2 and 3: iterated update with all sightings of known features."""
+        here.correct(self._rows(here, matches))
+
+    def _rows(self, here: FeatureMap, matches: dict[Kind, Matches]) -> Callable[[], Rows]:
+        """What gives the rows of all sightings of known features at the map's present mean."""
         walls, wall_of = _known(matches[Kind.WALL])
         sightings = self._walls.chosen(walls)
         spots: list[tuple[SpotSightings, IntArray, int]] = []
@@ -244,7 +262,7 @@ class _Look:
                 rows += seen.rows(here.states, feature, features[feature], directions)
             return rows
 
-        here.correct(look)
+        return look
 
     def note(self, here: FeatureMap, matches: dict[Kind, Matches]) -> None:
         """Remember what was seen of known features."""

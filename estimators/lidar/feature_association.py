@@ -25,6 +25,9 @@ LIKE = np.deg2rad(30.0)
 """Directions of walls that differ by more are not compared [rad]."""
 REACH = 0.5
 """A wall may be seen so much further along than ever before [m]."""
+TOLD_APART = 0.2
+"""Where the expected place of a feature is less certain than this [m], it may as well be its neighbour: what is
+seen there is of a new one, against which motion goes on."""
 NEAR = 1.0
 """Corners and poles further apart are not compared [m]."""
 
@@ -131,7 +134,7 @@ def _distances(
     sighting: IntArray,
     feature: IntArray,
 ) -> FloatArray:
-    """Squared Mahalanobis distances (P,) of pairs of a sighting and a feature.
+    """Squared Mahalanobis distances (P,) of pairs of a sighting and a feature; infinite for no telling.
 
     Args:
         here: states and features as predicted.
@@ -149,7 +152,8 @@ def _distances(
     shared = by_feature @ HP[sighting[:, None], :, columns]
     of_features = by_feature @ here.cov[columns[:, :, None], columns[:, None]] @ by_feature.transpose(0, 2, 1)
     S = S[sighting] + shared + shared.transpose(0, 2, 1) + of_features
-    return np.asarray((residual * np.linalg.solve(S, residual[:, :, None])[:, :, 0]).sum(axis=1))
+    distance = (residual * np.linalg.solve(S, residual[:, :, None])[:, :, 0]).sum(axis=1)
+    return np.where(S[:, 0, 0] < TOLD_APART**2, distance, np.inf)
 
 
 def _unambiguous(count: int, sighting: IntArray, feature: IntArray, distance: FloatArray) -> Matches:

@@ -18,6 +18,7 @@ from enum import IntEnum
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
+from estimators import chi2
 from estimators.geometry import inverse, rotation, transform, wrap_angle, wrap_angles
 from estimators.lidar.scan_fit import LEAST_INFORMATION, held_directions
 from estimators.lidar.sightings import NOW, STATES, Rows
@@ -26,6 +27,8 @@ from estimators.messages import FloatArray, IntArray
 MOST_ITERATIONS = 5
 CONVERGED = 1e-5
 """A step of the pose that is smaller [m, rad] is the last."""
+_JOINTLY = 0.999
+"""Share of right associations that pass as a whole."""
 UNTHREADED = 8
 """Rows that are taken into the covariance at once: of more, BLAS would start threads for it, and wait for
 them longer than the product takes."""
@@ -101,6 +104,34 @@ class FeatureMap:
         self.cov[6:STATES, 6:STATES] += Q
         self.unseen += 1
 
+    def misfit(self, rows: Rows) -> int | None:
+        """The feature whose sightings fit the others least, when all together they do not pass a gate.
+
+        Each by itself may, where the pose is uncertain: together they would need motion that nobody expects.
+
+        Args:
+            rows: at the predicted mean, at least one.
+
+        Source: Neira and Tardos, "Data association in stochastic mapping using the joint compatibility test",
+        IEEE Transactions on Robotics and Automation 17, 2001.
+        """
+        precision = np.linalg.inv(self._innovation(rows)[1])
+        pulls = precision @ rows.residual
+        if rows.residual @ pulls < chi2.ppf(_JOINTLY, len(pulls)):
+            return None
+        return int(rows.feature[np.argmax(pulls**2 / np.diag(precision))])
+
+    def _innovation(self, rows: Rows) -> tuple[FloatArray, FloatArray]:
+        """Covariance of M rows with the mean (M, N) and with each other (M, M)."""
+        by_states = _held(rows)
+        columns = STATES + 2 * rows.feature[:, None] + [0, 1]
+        HP = by_states @ self.cov[:STATES]
+        HP += (rows.by_feature[:, :, None] * self.cov[columns]).sum(axis=1)
+        S = HP[:, :STATES] @ by_states.T
+        S += (HP[:, columns] * rows.by_feature).sum(axis=2)
+        S[np.diag_indices(len(S))] += rows.noise
+        return HP, S
+
     def correct(self, look: Callable[[], Rows]) -> None:
         """Stage 3: iterated update.
 
@@ -115,16 +146,11 @@ class FeatureMap:
         prior = self.mean
         for _ in range(MOST_ITERATIONS):
             rows = look()
-            by_states = _held(rows)
-            columns = STATES + 2 * rows.feature[:, None] + [0, 1]
-            HP = by_states @ self.cov[:STATES]
-            HP += (rows.by_feature[:, :, None] * self.cov[columns]).sum(axis=1)
-            S = HP[:, :STATES] @ by_states.T
-            S += (HP[:, columns] * rows.by_feature).sum(axis=2)
-            S[np.diag_indices(len(S))] += rows.noise
+            HP, S = self._innovation(rows)
             factor = cho_factor(S, lower=True)
             moved = self.mean - prior
-            linear = by_states @ moved[:STATES] + (rows.by_feature * moved[columns]).sum(axis=1)
+            columns = STATES + 2 * rows.feature[:, None] + [0, 1]
+            linear = _held(rows) @ moved[:STATES] + (rows.by_feature * moved[columns]).sum(axis=1)
             before = self.pose
             self.mean = prior + cho_solve(factor, linear - rows.residual) @ HP
             if float(np.abs(self.pose - before).max()) < CONVERGED:

@@ -94,6 +94,5 @@ def test_chen2019_is_measured_leg_by_leg() -> None:
 
 def test_names_of_legs_must_fit_the_walk(tmp_path: Path) -> None:
     walk = "[trajectory]\nwaypoints = [[1.5, 1.2], [3.5, 1.2]]\nlaps = 0\nleg_names = "
-    for names, more in (('["a", "b"]', "[increments]\n"), ('["a"]', "")):
-        with pytest.raises(UserError, match="leg_names"):
-            load_scenario(write_scenario(tmp_path, walk + names + "\n", more), 1, [])
+    with pytest.raises(UserError, match="leg_names"):
+        load_scenario(write_scenario(tmp_path, walk + '["a", "b"]\n', "[increments]\n"), 1, [])
