@@ -53,7 +53,8 @@ class MapScene:
         self._primary = names[0]
         self.colours = dict(zip(names, chain((SKY,), cycle(OTHER_ESTIMATORS)), strict=False))
         self._tracks: dict[str, list[FloatArray]] | None = {} if keeps_tracks else None
-        self._grid = None if config.site.walls or not keeps_tracks else OccupancyGrid(OccupancyGrid.Config())
+        is_known = config.site.walls or config.site.map is not None
+        self._grid = None if is_known or not keeps_tracks else OccupancyGrid(OccupancyGrid.Config())
         self._send_site()
         self._anchors = AnchorMarks(entities, config)
 
@@ -63,6 +64,13 @@ class MapScene:
         if self._config.site.walls:
             walls = [np.array(wall) for wall in self._config.site.walls]
             put("map/walls", rr.LineStrips2D(walls, colors=GREY, radii=screen(1.5)))
+        if self._config.site.map is not None:
+            floor = self._config.site.map.floor_map()
+            self._send_obstacles(floor.obstacle_points(floor.cell), floor.cell)
+
+    def _send_obstacles(self, centres: FloatArray, cell: float) -> None:
+        cells = rr.Points2D(centres, colors=GREY, radii=0.5 * cell, draw_order=5.0)
+        self._entities.static("map/obstacles", cells)
 
     def send(self, batch: Batch) -> None:
         """Draw a batch."""
@@ -84,7 +92,7 @@ class MapScene:
         self._keep("autopilot", xy)
 
     def close(self) -> None:
-        """Draw whole tracks, and the grid of obstacles where the site has no walls."""
+        """Draw whole tracks, and the grid of obstacles where the site has neither walls nor a map."""
         assert self._tracks is not None
         for name, pieces in self._tracks.items():
             path = f"map/estimate/{name}" if name in self.colours else f"map/{name}"
@@ -103,8 +111,7 @@ class MapScene:
         if self._grid is not None:
             rows, columns = np.nonzero(self._grid.obstacles)
             centres = self._grid.origin + (np.column_stack([columns, rows]) + 0.5) * self._grid.cell
-            cells = rr.Points2D(centres, colors=GREY, radii=0.5 * self._grid.cell, draw_order=5.0)
-            self._entities.static("map/obstacles", cells)
+            self._send_obstacles(centres, self._grid.cell)
 
     def _keep(self, name: str, xy: FloatArray) -> None:
         if self._tracks is not None:

@@ -17,11 +17,13 @@ from rerun.chunk import RrdReader
 from companion.config import Config
 from companion.errors import UserError
 from companion.log import Direction, Log, RawChunk, Truth
+from companion.map_table import MapTable
 from companion.pipeline import Tick
 from companion.replay import config_of, replay
 from companion.sim.world import World
 from companion.view.files import RerunFiles
 from estimators.base import Verdict
+from estimators.lidar.floor_map import FloorMap
 from estimators.messages import FloatArray, RangeFrame, Scan
 from tests.companion.view.recordings import Recording, read
 
@@ -291,6 +293,14 @@ def test_estimators_without_heading_or_ranges_can_be_primary(run: Run, tmp_path:
 def test_a_run_of_no_ticks_is_an_empty_map(config: Config, tmp_path: Path) -> None:
     RerunFiles(config, ["ekf"], tmp_path / "run.rrd", 0).close()
     assert "map/walls" in read(tmp_path / "run.rrd")
+
+
+def test_a_saved_map_is_drawn_where_it_stands(config: Config, tmp_path: Path) -> None:
+    floor = FloorMap(np.eye(3, dtype=bool), ~np.eye(3, dtype=bool), 0.1, np.array([1.0, 2.0, 0.3]))
+    site = config.site.model_copy(update={"map": MapTable.of(floor, "room.yaml")})
+    RerunFiles(config.model_copy(update={"site": site}), ["ekf"], tmp_path / "run.rrd", 0).close()
+    (cells,) = read(tmp_path / "run.rrd")["map/obstacles"]["Points2D:positions"]
+    assert np.array(cells) == pytest.approx(floor.obstacle_points(floor.cell), abs=1e-6)
 
 
 def test_a_file_that_cannot_be_written_is_the_users_error(config: Config, tmp_path: Path) -> None:
