@@ -26,8 +26,8 @@ LIKE = np.deg2rad(30.0)
 REACH = 0.5
 """A wall may be seen so much further along than ever before [m]."""
 TOLD_APART = 0.2
-"""Where the expected place of a feature is less certain than this [m], it may as well be its neighbour: what is
-seen there is of a new one, against which motion goes on."""
+"""Where the expected place of a feature is less certain than this [m], it may as well be its neighbour: what
+is seen there is of a new one, against which motion goes on."""
 NEAR = 1.0
 """Corners and poles further apart are not compared [m]."""
 
