@@ -69,7 +69,9 @@ class Viewer:
         if self._mode == "native":
             return ""
         host = _host(self._bind)
-        return f"http://{host}:{self._web_port}/?url=rerun%2Bhttp%3A%2F%2F{host}%3A{self._data_port}%2Fproxy"
+        data = f"rerun%2Bhttp%3A%2F%2F{host}%3A{self._data_port}%2Fproxy"
+        # Labels are drawn for a dark ground, whatever the browser prefers.
+        return f"http://{host}:{self._web_port}/?url={data}&theme=dark"
 
     @property
     def is_page(self) -> bool:

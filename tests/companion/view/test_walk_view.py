@@ -95,7 +95,7 @@ def page(scenario: Scenario) -> str:
     """Address at which the scenario's view is served."""
     view = scenario.config.view
     data = f"rerun%2Bhttp%3A%2F%2F127.0.0.1%3A{view.data_port}%2Fproxy"
-    return f"http://127.0.0.1:{view.web_port}/?url={data}"
+    return f"http://127.0.0.1:{view.web_port}/?url={data}&theme=dark"
 
 
 def test_a_window_without_a_screen_is_the_users_error(
