@@ -348,6 +348,7 @@ class Config(Table):
             walls=[np.array(wall) for wall in self.site.walls],
             lidar_in_body=self.lidar_mounting(),
             floor_map=self.site.map.floor_map() if self.site.map is not None else None,
+            scan_preparation=self.scan_preparation,
         )
 
     def range_biases(self) -> dict[int, RangeBias]:

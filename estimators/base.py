@@ -7,6 +7,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from estimators.lidar.floor_map import FloorMap
+from estimators.lidar.scan_preparation import ScanPreparation
 from estimators.messages import PLANAR, FloatArray, Measurement, PoseEstimate
 
 
@@ -113,6 +114,7 @@ class Setup:
         walls: polylines (N, 2) [m], map frame.
         lidar_in_body: (3,) x [m], y [m], yaw [rad] of the LiDAR in the body frame.
         floor_map: made on an earlier visit, with at least one obstacle; None without.
+        scan_preparation: what is done with scans beforehand.
     """
 
     anchors: dict[int, FloatArray]
@@ -125,6 +127,7 @@ class Setup:
     walls: list[FloatArray] = field(default_factory=list)
     lidar_in_body: FloatArray = field(default_factory=lambda: np.zeros(3))
     floor_map: FloorMap | None = None
+    scan_preparation: ScanPreparation.Config = field(default_factory=ScanPreparation.Config)
 
     def height_to(self, anchor: FloatArray) -> float:
         """Height of an anchor above the tag [m]."""

@@ -37,7 +37,7 @@ class MapSearch:
 
     def __init__(self, floor: FloorMap, range_sigma: float, setup: Setup) -> None:
         self._relocaliser = Relocaliser(Relocaliser.Config(range_sigma=range_sigma), floor, setup)
-        self._preparation = ScanPreparation(ScanPreparation.Config(), setup.lidar_in_body)
+        self._preparation = ScanPreparation(setup.scan_preparation, setup.lidar_in_body)
         self._across = floor.cell * float(np.hypot(*floor.occupied.shape))
         self.reset()
 

@@ -9,6 +9,7 @@ import pytest
 from estimators import estimator_config_class, make_estimator
 from estimators.base import Estimator, Setup, Start
 from estimators.geometry import between, compose, wrap_angle
+from estimators.lidar.scan_preparation import ScanPreparation
 from estimators.messages import FloatArray, Measurement, PoseIncrement, RangeFrame, Scan
 from estimators.relocation.map_search import ALONE_AFTER_NS, MOST_CELLS
 from estimators.relocation.recovery import Recovering
@@ -133,6 +134,21 @@ def test_a_standing_robot_without_ranges_is_found_a_little_later() -> None:
     estimator.reset()
     _, now_ns = feed(estimator, stream(FURNISHED, standing(POSE), 3.5, anchors=()))
     assert_at(estimator, now_ns, POSE)
+
+
+@pytest.mark.parametrize(("min_range", "is_found"), [(0.1, False), (0.5, True)])
+def test_limits_of_the_site_hold_in_the_search(min_range: float, is_found: bool) -> None:
+    preparation = ScanPreparation.Config(min_range=min_range)
+    estimator = recovering(replace(in_map(FURNISHED), scan_preparation=preparation))
+    now_ns = 0
+    for measurement in stream(FURNISHED, standing(POSE), 1.0):
+        if isinstance(measurement, Scan):
+            # A frame round the scanner hides every second beam.
+            ranges = np.where(np.arange(len(measurement.ranges)) % 2, 0.4, measurement.ranges)
+            measurement = replace(measurement, ranges=ranges)  # noqa: PLW2901
+            now_ns = measurement.end_stamp_ns
+        estimator.update(measurement)
+    assert (estimator.pose_at(now_ns) is not None) == is_found
 
 
 def test_places_that_look_alike_are_told_and_not_taken_until_ranges_decide() -> None:
