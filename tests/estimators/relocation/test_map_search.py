@@ -145,7 +145,7 @@ def test_limits_of_the_site_hold_in_the_search(min_range: float, is_found: bool)
         if isinstance(measurement, Scan):
             # A frame round the scanner hides every second beam.
             ranges = np.where(np.arange(len(measurement.ranges)) % 2, 0.4, measurement.ranges)
-            measurement = replace(measurement, ranges=ranges)  # noqa: PLW2901
+            measurement = replace(measurement, ranges=ranges)
             now_ns = measurement.end_stamp_ns
         estimator.update(measurement)
     assert (estimator.pose_at(now_ns) is not None) == is_found
