@@ -17,7 +17,7 @@ from pydantic import Field
 from estimators.geometry import inverse, rotation, transform, transform_each
 from estimators.lidar.expectation import MotionNoise, expect
 from estimators.lidar.known_motion import GyroTrack, OdometryTrack
-from estimators.lidar.scan_fit import NEWEST, UNKNOWN_SPEED_SIGMA, said_by_scan, search_start, settle
+from estimators.lidar.scan_fit import NEWEST, UNKNOWN_SPEED_SIGMA, said_by_scan, search_start
 from estimators.lidar.scan_preparation import LEAST_GAP_NS, PreparedScan, ScanPreparation
 from estimators.messages import FloatArray, ImuSample, Measurement, PoseIncrement, Scan
 from estimators.models.motion_settings import MotionInScans
@@ -217,7 +217,7 @@ class ScanMatcher:
         predicted = np.concatenate([expected.state, F @ expected.state])
         doubt = np.sqrt(np.diag(F @ expected.cov @ F.T + Q)[:3])
         start = search_start(keyframe, found, basis, predicted, doubt, dt, config.max_correspondence)
-        fit = settle(keyframe, found, basis, prior, predicted, start, self._ranges_to_walls(found))
+        fit = keyframe.settle(found, basis, prior, predicted, start, self._ranges_to_walls(found))
         if fit is None:
             return None
         # A bare wall looks the same everywhere: after a long gap it is only known to be one when all fits.
@@ -229,7 +229,7 @@ class ScanMatcher:
         states = fit.states
         in_keyframe = transform_each(expected.basis @ states.reshape(4, 3), expected.points)
         self.points = transform(inverse(states[NEWEST]), in_keyframe)
-        increment, cov = said_by_scan(prior, predicted, fit)
+        increment, cov = said_by_scan(predicted, fit)
         rows, index = keyframe.match(found.points, found.normals, basis, states)
         bent = expected.bent(1.0 + scan.times[found.own][index >= 0] / dt, rows[index >= 0, 1:4])
         states[9:11] += rotation(states[8]) @ expected.twist[:2]
