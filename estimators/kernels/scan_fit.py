@@ -156,12 +156,13 @@ def held_directions(pose_hessian: FloatArray, feigned: FloatArray) -> FloatArray
     values, vectors = np.linalg.eigh(np.linalg.solve(root, half.T.copy()))
     free = (values <= HELD_RATIO).sum()
     across, _ = np.linalg.qr(np.linalg.solve(root.T.copy(), vectors[:, :free].copy()))
-    return np.eye(3) - across.copy() @ across.T.copy()
+    held: FloatArray = np.eye(3) - across.copy() @ across.T.copy()
+    return held
 
 
 @compiled(f"{MATRIX}({MATRIX})")
 def newest_information(information: FloatArray) -> FloatArray:
-    """Information (3, 3) on the newer pose in that on both states (12, 12), the others not being asked for."""
+    """Information (3, 3) on the newer pose in that on both states (12, 12), whatever the others are."""
     ordered = np.empty((12, 12))
     order = np.array([0, 1, 2, 3, 4, 5, 9, 10, 11, 6, 7, 8])
     for i in range(12):
@@ -222,14 +223,15 @@ def settle(
         matched = associate(points, normals, basis, states, lines, begin, grid, columns, rows, index)
         if matched < LEAST_MATCHED:
             return matched, states, information, held, held
-        n = 0
+        # Cauchy weight; its scale is the noise of two scans, or 1.5 times the median distance when larger.
+        scale, n, small, middle = 2.0 * sigma, 0, 0, matched // 2
         for i in range(len(points)):
             if index[i] >= 0:
                 distances[n] = abs(rows[i, 0])
+                small += 1.5 * distances[n] <= scale
                 n += 1
-        # Cauchy weight; its scale is the noise of two scans, or what the distances say when larger.
-        middle = matched // 2
-        scale = max(2.0 * sigma, 1.5 * np.partition(distances[:matched], middle)[middle])
+        if small <= middle:
+            scale = 1.5 * np.partition(distances[:matched], middle)[middle]
         hessian, gradient, pose_hessian, feigned, total, squares = normal_equations(
             basis, rows, index, lines, scale
         )

@@ -54,8 +54,6 @@ class Expectation:
             shares: (M,) of the way in time from the scan before, of the beams that are matched.
             by_pose: (M, 3) change of each beam's distance from its line with the pose at its instant.
         """
-        if not self.drift.any():
-            return self.drift
         by_end = shares[:, None] * by_pose
         hessian = by_end.T @ by_end + _LEAST_VARIANCE * np.eye(3)
         cov = np.zeros((3, 3))

@@ -230,8 +230,10 @@ class ScanMatcher:
         in_keyframe = transform_each(expected.basis @ states.reshape(4, 3), expected.points)
         self.points = transform(inverse(states[NEWEST]), in_keyframe)
         increment, cov = said_by_scan(predicted, fit)
-        rows, index = keyframe.match(found.points, found.normals, basis, states)
-        bent = expected.bent(1.0 + scan.times[found.own][index >= 0] / dt, rows[index >= 0, 1:4])
+        bent = expected.drift
+        if bent.any():
+            rows, index = keyframe.match(found.points, found.normals, basis, states)
+            bent = expected.bent(1.0 + scan.times[found.own][index >= 0] / dt, rows[index >= 0, 1:4])
         states[9:11] += rotation(states[8]) @ expected.twist[:2]
         states[11] += expected.twist[2]
         velocity = states[9:]
