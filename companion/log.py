@@ -9,21 +9,25 @@ import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import StrEnum
-from io import BufferedReader
+from io import BufferedReader, BytesIO
 from os import fstat
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from mcap.exceptions import McapError
-from mcap.records import Channel, Message, Metadata
-from mcap.stream_reader import StreamReader
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import EndOfFile, McapError
+from mcap.opcode import Opcode
+from mcap.records import Channel, Chunk, Message, Metadata
+from mcap.stream_reader import breakup_chunk
 from mcap.writer import MCAP0_MAGIC, Writer
 
 from companion import __version__
 from companion.errors import UserError
 from estimators.messages import FloatArray
 
+_RECORD = struct.Struct("<BQ")
+_MESSAGE = struct.Struct("<HIQQ")
 RUN = "companion.run"
 TRUTH_TOPIC = "/truth"
 _TRUTH_SCHEMA = {
@@ -40,6 +44,11 @@ class Direction(StrEnum):
     OUT = "out"
 
 
+_OTHERS = {
+    Opcode.CHANNEL: Channel.read,
+    Opcode.CHUNK: Chunk.read,
+    Opcode.METADATA: Metadata.read,
+}
 _DIRECTIONS = frozenset(direction.value for direction in Direction)
 
 
@@ -156,27 +165,29 @@ class Log:
     def __iter__(self) -> Iterator[RawChunk | Truth]:
         """Everything in the order in which it was written."""
         topics: dict[int, str] = {}
+        chunks: dict[int, tuple[str, Direction]] = {}
         with self._open() as file:
-            size = max(fstat(file.fileno()).st_size, 1)
             for record in self._records(file):
-                self.share_read = file.tell() / size
-                if isinstance(record, Channel):
+                if isinstance(record, Message):
+                    if record.channel_id in chunks:
+                        source, direction = chunks[record.channel_id]
+                        yield RawChunk(source, direction, record.log_time, record.data)
+                    elif topics.get(record.channel_id) == TRUTH_TOPIC:
+                        yield from self._truth(record)
+                elif isinstance(record, Channel):
                     topics[record.id] = record.topic
-                elif isinstance(record, Message):
-                    yield from self._decode(topics.get(record.channel_id, ""), record)
+                    parts = record.topic.split("/")
+                    if len(parts) == 4 and parts[1] == "raw" and parts[3] in _DIRECTIONS:
+                        chunks[record.id] = (parts[2], Direction(parts[3]))
 
-    def _decode(self, topic: str, message: Message) -> Iterator[RawChunk | Truth]:
-        parts = topic.split("/")
-        if len(parts) == 4 and parts[1] == "raw" and parts[3] in _DIRECTIONS:
-            yield RawChunk(parts[2], Direction(parts[3]), message.log_time, message.data)
-        elif topic == TRUTH_TOPIC:
-            try:
-                pose = json.loads(message.data)
-                x, y, yaw = pose["x"], pose["y"], pose["yaw"]
-            except (ValueError, KeyError):
-                self.complete = False
-            else:
-                yield Truth(message.log_time, np.array([x, y, np.nan if yaw is None else yaw]))
+    def _truth(self, message: Message) -> Iterator[Truth]:
+        try:
+            pose = json.loads(message.data)
+            x, y, yaw = pose["x"], pose["y"], pose["yaw"]
+        except (ValueError, KeyError):
+            self.complete = False
+        else:
+            yield Truth(message.log_time, np.array([x, y, np.nan if yaw is None else yaw]))
 
     def _open(self) -> BufferedReader:
         try:
@@ -191,7 +202,29 @@ class Log:
         return file
 
     def _records(self, file: BufferedReader) -> Iterator[Any]:
+        """Channels, messages and metadata.
+
+        Nearly all records are messages, and a message is unpacked at once: the library's reader, which takes
+        each of its numbers from the stream by itself, takes three times as long.
+        """
+        size = fstat(file.fileno()).st_size
+        at = file.seek(len(MCAP0_MAGIC))
+        opcode = 0
         try:
-            yield from StreamReader(file).records
+            while opcode != Opcode.FOOTER:
+                opcode, length = _RECORD.unpack(file.read(_RECORD.size))
+                at += _RECORD.size + length
+                if at > size:
+                    raise EndOfFile
+                content = file.read(length)
+                self.share_read = at / size
+                if opcode == Opcode.MESSAGE:
+                    channel, sequence, log_ns, publish_ns = _MESSAGE.unpack_from(content)
+                    yield Message(channel, log_ns, content[_MESSAGE.size :], publish_ns, sequence)
+                elif opcode in _OTHERS:
+                    record = _OTHERS[opcode](ReadDataStream(BytesIO(content)))
+                    yield from breakup_chunk(record) if isinstance(record, Chunk) else [record]
+            if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
+                raise EndOfFile
         except (McapError, struct.error, ValueError):
             self.complete = False

@@ -4,7 +4,7 @@ Source: Slamtec interface protocol rev 2.2; rplidar_sdk @99478e5.
 """
 
 from itertools import pairwise
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
@@ -43,18 +43,31 @@ _ANSWER_START = b"\xa5\x5a"
 _PAUSE_NS = 50_000_000  # packets follow each other sooner, answers after a STOP do not
 
 
+class _Part(NamedTuple):
+    """Consecutive samples, (n,) each."""
+
+    angle_q14: IntArray
+    distance_q2: IntArray
+    quality: IntArray
+    times_ns: IntArray
+
+    def cut(self, first: int, end: int) -> "_Part":
+        """Those from the first up to the end."""
+        return _Part(*(column[first:end] for column in self))
+
+
 class _Revolution:
     """Samples since the last start of a revolution; knows whether they may become a `Scan`."""
 
     def __init__(self) -> None:
-        self._parts: list[IntArray] = []  # (4, n): angle_q14, distance_q2, quality, time [ns]
+        self._parts: list[_Part] = []
         self._intact = True
 
-    def add(self, part: IntArray) -> None:
-        """Append samples; (4, n)."""
-        if self._intact and part.shape[1]:
+    def add(self, part: "_Part") -> None:
+        """Append samples."""
+        if self._intact and len(part.times_ns):
             self._parts.append(part)
-            if part[3, -1] - self._parts[0][3, 0] > _MAX_REVOLUTION_NS:
+            if part.times_ns[-1] - self._parts[0].times_ns[0] > _MAX_REVOLUTION_NS:
                 self.spoil()
 
     def spoil(self) -> None:
@@ -64,9 +77,9 @@ class _Revolution:
 
     def scan(self, min_range: float, max_range: float) -> Scan | None:
         """The finished revolution; None when it is spoilt or has too few samples."""
-        if sum(part.shape[1] for part in self._parts) < _MIN_SAMPLES:
+        if sum(len(part.times_ns) for part in self._parts) < _MIN_SAMPLES:
             return None
-        angle_q14, distance_q2, quality, times_ns = np.concatenate(self._parts, axis=1)
+        angle_q14, distance_q2, quality, times_ns = map(np.concatenate, zip(*self._parts, strict=True))
         # clockwise in 65536 parts of a turn -> counter-clockwise in [-pi, pi)
         half_turns = ((32768 - angle_q14) % 65536 - 32768) / 32768
         ranges = distance_q2 / 4000
@@ -214,12 +227,12 @@ class Rplidar:
                 self._revolution.spoil()
         times_ns = self._sample_times(samples, arrival_ns)
         quality = samples.quality if samples.scan_type in _WITH_QUALITY else np.zeros_like(times_ns)
-        table = np.stack((samples.angle_q14, samples.distance_q2, quality, times_ns))
+        part, count = _Part(samples.angle_q14, samples.distance_q2, quality, times_ns), len(times_ns)
         scans: list[Scan] = []
-        starts = np.flatnonzero(samples.starts).tolist()
+        starts = samples.starts.nonzero()[0].tolist()
         if self._revolution is not None:
-            self._revolution.add(table[:, : starts[0] if starts else None])
-        for first, end in pairwise([*starts, table.shape[1]]):
+            self._revolution.add(part.cut(0, starts[0]) if starts else part)
+        for first, end in pairwise([*starts, count]):
             if self._revolution is not None:
                 scan = self._revolution.scan(self._config.min_range, self._config.max_range)
                 if scan is None:
@@ -228,7 +241,7 @@ class Rplidar:
                     scans.append(scan)
                     self._dialogue.hear(scan)
             self._revolution = _Revolution()
-            self._revolution.add(table[:, first:end])
+            self._revolution.add(part.cut(first, end))
         return scans
 
     def _sample_times(self, samples: Samples, arrival_ns: int) -> IntArray:

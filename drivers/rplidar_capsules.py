@@ -53,6 +53,9 @@ class Capsules(ABC):
         if count <= 0:
             return _NONE
         raw = np.frombuffer(data, np.uint8)
+        if count == 1:
+            whole = int(np.bitwise_xor.reduce(raw[2:]))
+            return np.array([raw[0] == (whole & 15 | _SYNC[0]) and raw[1] == (whole >> 4 | _SYNC[1])])
         folded = np.bitwise_xor.accumulate(raw)
         checksum = folded[self.PACKET_BYTES - 1 :] ^ folded[1 : count + 1]
         begins: BoolArray = raw[:count] == (checksum & 15 | _SYNC[0])

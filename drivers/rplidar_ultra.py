@@ -19,6 +19,8 @@ _LEVEL_MM = np.array([0, 512, 2048, 4096, 16384])
 _MAJOR = np.arange(4096)
 _MAJOR_LEVEL = np.searchsorted(_LEVEL_CODE, _MAJOR, side="right") - 1
 _MAJOR_MM = _LEVEL_MM[_MAJOR_LEVEL] + ((_MAJOR - _LEVEL_CODE[_MAJOR_LEVEL]) << _MAJOR_LEVEL)
+_LEVEL_BITS, _LEVEL_MASK = 3, 7
+_MAJOR_PACKED = _MAJOR_MM << _LEVEL_BITS | _MAJOR_LEVEL  # both in one look-up; 0 stands for no return alone
 _MAJOR_MIDDLES = (_MAJOR_MM[:-1] + _MAJOR_MM[1:]) / 2
 _NO_RETURN = -512  # the difference that says so; 511 does too
 _MAX_DIFFERENCE = 510
@@ -43,27 +45,25 @@ class UltraCapsules(Capsules):
 
     def _measure(self, packets: ByteArray) -> tuple[IntArray, IntArray, IntArray | None]:
         words = packets[:, _ULTRA_BODY:].copy().view("<i4").ravel()
-        words = words[: (len(packets) - 1) * _ULTRA_WORDS + 1]
-        major = words.astype(np.int64) & 0xFFF
-        mm, level = _MAJOR_MM[major], _MAJOR_LEVEL[major]
+        words = words[: (len(packets) - 1) * _ULTRA_WORDS + 1].astype(np.int64)
+        rounded = _MAJOR_PACKED.take(words & 0xFFF)
+        own, following = rounded[:-1], rounded[1:]
         # The last of three comes just before the next rounded one, and is told from that.
-        mm, next_mm, level, next_level = mm[:-1], mm[1:], level[:-1], level[1:]
-        base, base_level = np.where(mm == 0, next_mm, mm), np.where(mm == 0, next_level, level)
-        threes = np.empty((len(mm), 3), np.int64)
-        threes[:, 0] = mm
-        threes[:, 1] = _predicted(base, base_level, words[:-1] << 10 >> 22)
-        threes[:, 2] = _predicted(next_mm, next_level, words[:-1] >> 22)
+        base, difference = np.empty((2, 2, len(own)), np.int64)
+        base[0] = np.where(own == 0, following, own)
+        base[1] = following
+        np.left_shift(words[:-1], 42, out=difference[0])
+        difference[0] >>= 54
+        np.right_shift(words[:-1], 22, out=difference[1])
+        predicted = (base >> _LEVEL_BITS) + (difference << (base & _LEVEL_MASK))
+        predicted[(difference ^ difference >> 63) == ~_NO_RETURN] = 0
+        threes = np.empty((len(own), 3), np.int64)
+        threes[:, 0] = own >> _LEVEL_BITS
+        # Below 0 cannot be.
+        np.maximum(predicted.T, 0, out=threes[:, 1:])
         distance_mm = threes.ravel()
         distance_q2 = distance_mm << 2
         return distance_q2, quality_of(distance_q2), ultra_offset_q16(distance_mm)
-
-
-def _predicted(base: IntArray, level: IntArray, difference: IntArray) -> IntArray:
-    """Distances [mm] from rounded ones; 0 for those marked so, and for those below 0, which cannot be."""
-    difference = difference.astype(np.int64)
-    distance = base + (difference << level)
-    distance[(difference ^ difference >> 63) == ~_NO_RETURN] = 0
-    return np.maximum(distance, 0)
 
 
 def _offsets_q16(distance_mm: IntArray) -> IntArray:

@@ -52,25 +52,24 @@ def fit_lines(
         x0, y0 = points[i, 0], points[i, 1]
         n, sx, sy, sxx, sxy, syy = 1, 0.0, 0.0, 0.0, 0.0, 0.0
         taken_least, gap_most = count, 0.0
-        spans[found] = i
         for side in (-1, 1):
             taken, last = 0, min(gaps[i], gaps[i + 1])
             j = i + side
             while 0 <= j < count and taken < MOST_NEIGHBOURS:
                 x, y = points[j, 0], points[j, 1]
                 gap = gaps[max(j, j - side)]
-                if taken >= LEAST_NEIGHBOURS and hypot(x - x0, y - y0) > reach:
+                x, y = x - x0, y - y0
+                if taken >= LEAST_NEIGHBOURS and x * x + y * y > reach * reach:
                     break
                 if gap > GAP_RATIO * max(last, sigma):
                     break
-                x, y = x - x0, y - y0
                 sx, sy, n = sx + x, sy + y, n + 1
                 sxx, sxy, syy = sxx + x * x, sxy + x * y, syy + y * y
                 last = gap
                 gap_most = max(gap_most, gap)
                 taken += 1
-                spans[found, max(side, 0)] = j
                 j += side
+            spans[found, max(side, 0)] = i + side * taken
             taken_least = min(taken_least, taken)
         if taken_least < LEAST_NEIGHBOURS:
             continue
@@ -107,7 +106,7 @@ def sort_into_cells(
 
     Args:
         lines: (M, 6).
-        grid: (3,) least x, least y, side of a cell [m].
+        grid: least x, least y, side of a cell [m].
         columns: number of cells along x.
         rows: number of cells along y.
 
@@ -115,10 +114,11 @@ def sort_into_cells(
         The lines (M, 6) in new order, where they were before (M,), and where each cell begins
         (columns * rows + 1,).
     """
+    per_cell = 1.0 / grid[2]
     begin = np.zeros(columns * rows + 1, dtype=np.int64)
     cells = np.empty(len(lines), dtype=np.int64)
     for i in range(len(lines)):
-        column, row = int((lines[i, 0] - grid[0]) / grid[2]), int((lines[i, 1] - grid[1]) / grid[2])
+        column, row = int((lines[i, 0] - grid[0]) * per_cell), int((lines[i, 1] - grid[1]) * per_cell)
         cells[i] = row * columns + column
         begin[cells[i] + 1] += 1
     for k in range(columns * rows):
@@ -152,27 +152,26 @@ def associate(
     """Nearest line of every point, and the point's distance from it.
 
     Args:
-        points: (N, 2) [m], each in the body frame of its own instant.
+        points: (N, 2) [m] in the order of the beams, each in the body frame of its own instant.
         normals: (N, 2) unit normals of the surface there, likewise.
         basis: (N, 4) weights of the state's four vectors in the pose at that instant.
         state: (12,) pose and velocity at the end of the scan before, pose and velocity at the end of this
             one, in the frame of the lines.
         lines: (M, 6) in the order of the cells.
         begin: where each cell begins in `lines`.
-        grid: (3,) least x, least y, side of a cell [m]; lines further away than that are not looked for.
+        grid: (4,) least x, least y, side of a cell, how far a line may be [m].
         columns: number of cells along x.
         out: (N, 6) is filled: signed distance [m], its derivative by the pose at the instant (3), lever arm
             of the point in the axes of the lines (2).
-        index: (N,) is filled: which line, -1 without one.
+        index: (N,) which line each point had with a state near by, -1 without one; is overwritten.
 
     Returns:
         How many points have a line.
     """
-    x0, y0, cell = grid[0], grid[1], grid[2]
+    x0, y0, per_cell, reach = grid[0], grid[1], 1.0 / grid[2], grid[3]
     rows = (len(begin) - 1) // columns
-    matched = 0
+    matched, nearest = 0, -1
     for i in range(len(points)):
-        index[i] = -1
         b0, b1, b2, b3 = basis[i, 0], basis[i, 1], basis[i, 2], basis[i, 3]
         yaw = b0 * state[2] + b1 * state[5] + b2 * state[8] + b3 * state[11]
         c, s = cos(yaw), sin(yaw)
@@ -181,17 +180,29 @@ def associate(
         x = arm_x + b0 * state[0] + b1 * state[3] + b2 * state[6] + b3 * state[9]
         y = arm_y + b0 * state[1] + b1 * state[4] + b2 * state[7] + b3 * state[10]
         normal_x, normal_y = c * normals[i, 0] - s * normals[i, 1], s * normals[i, 0] + c * normals[i, 1]
-        column, row = floor((x - x0) / cell), floor((y - y0) / cell)
-        nearest, best = -1, cell * cell
-        for r in range(max(row - 1, 0), min(row + 2, rows)):
-            first, last = max(column - 1, 0), min(column + 1, columns - 1)
-            if first > last:
-                continue
-            for k in range(begin[r * columns + first], begin[r * columns + last + 1]):
-                dx, dy = x - lines[k, 0], y - lines[k, 1]
-                distance = dx * dx + dy * dy
-                if distance < best and abs(normal_x * lines[k, 2] + normal_y * lines[k, 3]) > LEAST_COSINE:
-                    nearest, best = k, distance
+        best = reach * reach
+        # The line that it had, or that of the point before, is near: few cells can hold a nearer one.
+        k = index[i] if index[i] >= 0 else nearest
+        nearest = -1
+        if k >= 0:
+            dx, dy = x - lines[k, 0], y - lines[k, 1]
+            distance = dx * dx + dy * dy
+            if distance < best and abs(normal_x * lines[k, 2] + normal_y * lines[k, 3]) > LEAST_COSINE:
+                nearest, best = k, distance
+        around = sqrt(best)
+        first = max(floor((x - around - x0) * per_cell), 0)
+        last = min(floor((x + around - x0) * per_cell), columns - 1)
+        low = max(floor((y - around - y0) * per_cell), 0)
+        high = min(floor((y + around - y0) * per_cell), rows - 1)
+        if first <= last:
+            for r in range(low, high + 1):
+                for k in range(begin[r * columns + first], begin[r * columns + last + 1]):
+                    dx, dy = x - lines[k, 0], y - lines[k, 1]
+                    distance = dx * dx + dy * dy
+                    cosine = abs(normal_x * lines[k, 2] + normal_y * lines[k, 3])
+                    if distance < best and cosine > LEAST_COSINE:
+                        nearest, best = k, distance
+        index[i] = -1
         if nearest < 0:
             continue
         nx, ny = lines[nearest, 2], lines[nearest, 3]
@@ -208,92 +219,3 @@ def associate(
         index[i] = nearest
         matched += 1
     return matched
-
-
-@compiled(
-    f"Tuple(({MATRIX}, {VECTOR}, {MATRIX}, {MATRIX}, {MATRIX}, float64, float64))"
-    f"({MATRIX}, {MATRIX}, {INTEGERS}, {MATRIX}, float64)"
-)
-def normal_equations(
-    basis: FloatArray,
-    rows: FloatArray,
-    index: IntegerArray,
-    lines: FloatArray,
-    scale: float,
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, float, float]:
-    """Sums of Gauss-Newton over all matched points, with Cauchy weights.
-
-    Args:
-        basis: (N, 4) as for `associate`.
-        rows: (N, 6) of `associate`.
-        index: (N,) of `associate`.
-        lines: (M, 6).
-        scale: of the Cauchy weight [m].
-
-    Returns:
-        Hessian (12, 12) and gradient (12,) for unit variance; Hessian (3, 3) by the pose alone; what noise of
-        the normals adds to it on average (3, 3); how the gradient by the pose changes with the offset of each
-        line (M, 3); sum of the weights; weighted sum of squared distances [m^2].
-    """
-    blocks = np.zeros((4, 4, 3, 3))
-    hessian, gradient = np.zeros((12, 12)), np.zeros(12)
-    pose, feigned = np.zeros((3, 3)), np.zeros((3, 3))
-    by_line = np.zeros((len(lines), 3))
-    total, squares = 0.0, 0.0
-    j, t = np.empty(3), np.empty(3)
-    for i in range(len(rows)):
-        k = index[i]
-        if k < 0:
-            continue
-        r = rows[i, 0]
-        weight = 1.0 / (1.0 + (r / scale) ** 2)
-        total += weight
-        squares += weight * r * r
-        # What a turn of the normal by 1 rad does to the derivative.
-        t[0], t[1] = -rows[i, 2], rows[i, 1]
-        t[2] = t[1] * rows[i, 4] - t[0] * rows[i, 5]
-        noise = weight * lines[k, 4]
-        j[:] = rows[i, 1:4]
-        for a in range(3):
-            for b in range(3):
-                pose[a, b] += weight * j[a] * j[b]
-                feigned[a, b] += noise * t[a] * t[b]
-            by_line[k, a] += weight * j[a]
-        for a in range(3):
-            for b in range(a + 1):
-                product = weight * j[a] * j[b]
-                for p in range(4):
-                    for q in range(4):
-                        blocks[p, q, a, b] += basis[i, p] * basis[i, q] * product
-        for p in range(4):
-            for a in range(3):
-                gradient[3 * p + a] += weight * basis[i, p] * j[a] * r
-    for p in range(4):
-        for q in range(4):
-            for a in range(3):
-                for b in range(3):
-                    hessian[3 * p + a, 3 * q + b] = blocks[p, q, max(a, b), min(a, b)]
-    return hessian, gradient, pose, feigned, by_line, total, squares
-
-
-@compiled(f"{MATRIX}({MATRIX}, int64[:, ::1], int64)")
-def noise_of_points(by_line: FloatArray, spans: IntegerArray, count: int) -> FloatArray:
-    """Covariance (3, 3) of a sum over lines from noise of variance 1 of the points that lines go through.
-
-    Args:
-        by_line: (M, 3) change of the sum with the offset of each line.
-        spans: (M, 2) first and last point of each line.
-        count: number of points.
-    """
-    change, noise, share = np.zeros((count + 1, 3)), np.zeros((3, 3)), np.zeros(3)
-    for k in range(len(by_line)):
-        for a in range(3):
-            part = by_line[k, a] / (spans[k, 1] - spans[k, 0] + 1)
-            change[spans[k, 0], a] += part
-            change[spans[k, 1] + 1, a] -= part
-    for i in range(count):
-        share += change[i]
-        for a in range(3):
-            for b in range(3):
-                noise[a, b] += share[a] * share[b]
-    return noise

@@ -19,7 +19,7 @@ _LEAST_VARIANCE = 1e-8
 """Of what odometry says [m^2, rad^2]."""
 _WAVES = np.pi * np.arange(1, 7)
 """Wave numbers of a Brownian bridge's modes; what is left out has a seventh of its variance."""
-_CLAMPED_WAVES = np.array([4.730040745, 7.853204624, 10.995607838, 14.137165491])
+_CLAMPED_WAVES = np.array([4.730040745, 7.853204624, 10.995607838])
 """Of a bar clamped at both ends; what is left out has a hundredth of the variance."""
 
 
@@ -75,7 +75,7 @@ def bridge(shares: FloatArray) -> FloatArray:
 
 
 def clamped_bar(shares: FloatArray) -> FloatArray:
-    """Modes (4, M) by which motion under white acceleration deviates from a cubic, of unit power."""
+    """Modes (3, M) by which motion under white acceleration deviates from a cubic, of unit power."""
     waves = _CLAMPED_WAVES[:, None]
     ratio = (np.cosh(waves) - np.cos(waves)) / (np.sinh(waves) - np.sin(waves))
     phases = waves * np.clip(shares, 0.0, 1.0)

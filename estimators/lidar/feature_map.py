@@ -20,7 +20,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 from estimators import chi2
 from estimators.geometry import inverse, rotation, transform, wrap_angle, wrap_angles
-from estimators.lidar.scan_fit import LEAST_INFORMATION, held_directions
+from estimators.lidar.scan_fit import LEAST_INFORMATION
 from estimators.lidar.sightings import NOW, STATES, Rows
 from estimators.messages import FloatArray, IntArray
 
@@ -240,6 +240,9 @@ class FeatureMap:
 
 def _held(rows: Rows) -> FloatArray:
     """Derivative (R, 12) by the states, without directions of the pose that nothing holds."""
+    # Numba loads slowly: only who maps features waits for it.
+    from estimators.kernels.scan_fit import held_directions
+
     by_pose = rows.by_states[:, :3] + rows.by_states[:, 6:9]
     weight = 1.0 / rows.noise[:, None]
     feigned = rows.feigned.T @ (weight * rows.feigned) + LEAST_INFORMATION * np.eye(3)

@@ -4,17 +4,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from estimators.kernels.scan_lines import (
-    associate,
-    fit_lines,
-    noise_of_points,
-    normal_equations,
-    sort_into_cells,
-)
+from estimators.kernels import scan_fit as kernels
+from estimators.kernels.scan_lines import associate, fit_lines, sort_into_cells
+from estimators.lidar.scan_fit import Fit
 from estimators.messages import FloatArray, IntArray
 
 LINE_REACH = 10.0
 """Half the length of the neighbourhood through which a line is fitted, in standard deviations of a range."""
+CELLS = 4
+"""Cells of the grid for each line: a cell along a wall then holds a few lines."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,7 +51,6 @@ class Sums:
         hessian: (12, 12) and gradient (12,), by the state as `LineMap.match` takes it.
         pose_hessian: (3, 3) by the pose alone.
         feigned: (3, 3) what noise of the normals adds to `pose_hessian` on average.
-        by_line: (M, 3) change of the gradient by the pose with the offset of each line.
         weight: sum of the weights.
         squares: weighted sum of squared distances [m^2].
     """
@@ -62,9 +59,12 @@ class Sums:
     gradient: FloatArray
     pose_hessian: FloatArray
     feigned: FloatArray
-    by_line: FloatArray
     weight: float
     squares: float
+
+    def held(self) -> FloatArray:
+        """Projection (3, 3) of a change of the pose [m, rad] on what walls hold."""
+        return kernels.held_directions(self.pose_hessian, self.feigned)
 
 
 class LineMap:
@@ -80,10 +80,11 @@ class LineMap:
         found = surface(points, range_sigma)
         feet = found.lines[:, :2]
         lower, upper = (feet.min(axis=0), feet.max(axis=0)) if len(feet) else np.zeros((2, 2))
-        columns, rows = ((upper - lower) // reach).astype(np.int64) + 1
-        self._grid = np.array([*lower, reach])
-        self._columns = int(columns)
-        self._lines, order, self._begin = sort_into_cells(found.lines, self._grid, self._columns, int(rows))
+        width, height = upper - lower
+        side = max(reach / CELLS, np.sqrt(width * height / (CELLS * max(len(feet), 1))))
+        self._grid = np.array([*lower, side, reach])
+        self._columns, rows = int(width * (1.0 / side)) + 1, int(height * (1.0 / side)) + 1
+        self._lines, order, self._begin = sort_into_cells(found.lines, self._grid, self._columns, rows)
         self._spans = found.spans[order]
         self._points = len(points)
 
@@ -102,7 +103,7 @@ class LineMap:
             (N, 6) signed distance [m], its derivative by the pose at the instant (3,), the lever arm of the
             point in the axes of the map (2,); and which line, (N,), -1 without one.
         """
-        rows, index = np.empty((len(points), 6)), np.empty(len(points), dtype=np.int64)
+        rows, index = np.empty((len(points), 6)), np.full(len(points), -1)
         associate(
             points, normals, basis, state, self._lines, self._begin, self._grid, self._columns, rows, index
         )
@@ -117,11 +118,62 @@ class LineMap:
             index: (N,) of `match`.
             scale: of the Cauchy weight [m].
         """
-        return Sums(*normal_equations(basis, rows, index, self._lines, scale))
+        return Sums(*kernels.normal_equations(basis, rows, index, self._lines, scale))
 
-    def gradient_noise(self, by_line: FloatArray) -> FloatArray:
+    def gradient_noise(self, rows: FloatArray, index: IntArray, scale: float) -> FloatArray:
         """Covariance (3, 3) of the gradient by the pose from noise of this map's points, of unit variance.
 
-        Lines share their points with their neighbours, and many points may be matched to one line.
+        Args:
+            rows: (N, 6) of `match`.
+            index: (N,) of `match`.
+            scale: of the Cauchy weight [m].
         """
-        return noise_of_points(by_line, self._spans, self._points)
+        return kernels.gradient_noise(rows, index, scale, self._spans, self._points)
+
+    def settle(
+        self,
+        found: Surface,
+        basis: FloatArray,
+        prior: FloatArray,
+        predicted: FloatArray,
+        start: FloatArray,
+        sigma: float,
+        spread: float,
+    ) -> Fit | None:
+        """Minimise the distances of surface points from their lines and the deviation from the prediction.
+
+        Args:
+            found: surface points of the scan.
+            basis: (N, 4) as for `match`.
+            prior: (12, 12) information on the states beforehand.
+            predicted: (12,) states beforehand.
+            start: (12,) states to begin with.
+            sigma: least standard deviation of a distance [m].
+            spread: how far points may be off at the start [m].
+
+        Returns:
+            The fit; None when hardly a point is near a line.
+        """
+        matched, states, information, held, keyframe_cov, rows, index = kernels.settle(
+            found.points,
+            found.normals,
+            basis,
+            self._lines,
+            self._spans,
+            self._begin,
+            self._grid,
+            self._columns,
+            self._points,
+            prior,
+            predicted,
+            start,
+            sigma,
+            spread,
+        )
+        if matched < kernels.LEAST_MATCHED:
+            return None
+        before, after = kernels.newest_information(prior), kernels.newest_information(information)
+        share = matched / len(found.points)
+        of_lines = index >= 0
+        by_pose = rows[of_lines, 1:4]
+        return Fit(states, information, before, after, held, keyframe_cov, share, of_lines, by_pose)

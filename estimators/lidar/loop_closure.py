@@ -10,7 +10,6 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from estimators import chi2
 from estimators.geometry import between, compose, inverse, rotation, wrap_angle
-from estimators.lidar.scan_fit import held_directions
 from estimators.messages import FloatArray, LoopClosure
 
 if TYPE_CHECKING:
@@ -194,7 +193,7 @@ class LoopCloser:
                 return None
             scale = max(2.0 * sigma, 1.5 * float(np.median(distances)))
             sums = old.lines.sums(basis, rows, index, scale)
-            if np.linalg.matrix_rank(held_directions(sums.pose_hessian, sums.feigned), tol=0.5) < 3:
+            if np.linalg.matrix_rank(sums.held(), tol=0.5) < 3:
                 return None
             step = np.linalg.solve(sums.pose_hessian, -sums.gradient[6:9])
             state[6:9] += step
@@ -202,7 +201,7 @@ class LoopCloser:
                 break
         variance = max(sigma**2, 0.5 * sums.squares / sums.weight)
         gain = np.linalg.inv(sums.pose_hessian)
-        cov = variance * (gain + gain @ old.lines.gradient_noise(sums.by_line) @ gain)
+        cov = variance * (gain + gain @ old.lines.gradient_noise(rows, index, scale) @ gain)
         pose = state[6:9].copy()
         pose[2] = wrap_angle(pose[2])
         share = float(np.count_nonzero(distances < 3.0 * scale)) / len(points)

@@ -17,7 +17,7 @@ from pydantic import Field
 from estimators.geometry import inverse, rotation, transform, transform_each
 from estimators.lidar.expectation import MotionNoise, expect
 from estimators.lidar.known_motion import GyroTrack, OdometryTrack
-from estimators.lidar.scan_fit import NEWEST, UNKNOWN_SPEED_SIGMA, said_by_scan, search_start, settle
+from estimators.lidar.scan_fit import NEWEST, UNKNOWN_SPEED_SIGMA, said_by_scan, search_start
 from estimators.lidar.scan_preparation import LEAST_GAP_NS, PreparedScan, ScanPreparation
 from estimators.messages import FloatArray, ImuSample, Measurement, PoseIncrement, Scan
 from estimators.models.motion_settings import MotionInScans
@@ -220,7 +220,7 @@ class ScanMatcher:
         far = np.hypot(found.points[:, 0], found.points[:, 1]).mean() if len(found.points) else 0.0
         spread = min(2.0 * float(max(doubt[0], doubt[1], doubt[2] * far)), config.max_correspondence)
         sigma = self._ranges_to_walls(found)
-        fit = settle(keyframe, found, basis, prior, predicted, start, sigma, spread)
+        fit = keyframe.settle(found, basis, prior, predicted, start, sigma, spread)
         if fit is None:
             return None
         # A bare wall looks the same everywhere: after a long gap it is only known to be one when all fits.
@@ -232,9 +232,8 @@ class ScanMatcher:
         states = fit.states
         in_keyframe = transform_each(expected.basis @ states.reshape(4, 3), expected.points)
         self.points = transform(inverse(states[NEWEST]), in_keyframe)
-        increment, cov = said_by_scan(prior, predicted, fit)
-        rows, index = keyframe.match(found.points, found.normals, basis, states)
-        bent = expected.bent(1.0 + scan.times[found.own][index >= 0] / dt, rows[index >= 0, 1:4])
+        increment, cov = said_by_scan(predicted, fit)
+        bent = expected.bent(1.0 + scan.times[found.own][fit.matched] / dt, fit.by_pose)
         states[9:11] += rotation(states[8]) @ expected.twist[:2]
         states[11] += expected.twist[2]
         velocity = states[9:]

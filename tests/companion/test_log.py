@@ -13,10 +13,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from mcap.reader import make_reader
+from mcap.writer import CompressionType, Writer
 
 from companion import __version__
 from companion.errors import UserError
-from companion.log import Direction, Log, LogWriter, RawChunk, Truth
+from companion.log import RUN, Direction, Log, LogWriter, RawChunk, Truth
 
 chunks = st.builds(
     RawChunk,
@@ -114,6 +115,39 @@ def test_torn_anywhere_it_gives_a_prefix(tmp_path: Path) -> None:
         counts.append(len(read))
     assert counts == sorted(counts)
     assert counts[-1] == len(records)
+
+
+def test_what_other_tools_made_of_it_reads_the_same(tmp_path: Path) -> None:
+    records = [RawChunk("uwb", Direction.IN, i, bytes([i]) * 20) for i in range(20)]
+    write(tmp_path / "a.mcap", records)
+    plain = Log(tmp_path / "a.mcap")
+    with (tmp_path / "chunked.mcap").open("wb") as file:
+        writer = Writer(file, chunk_size=100, compression=CompressionType.LZ4)
+        writer.start()
+        writer.add_metadata(RUN, {"version": "1", "config": plain.config_toml, "start_ns": "42"})
+        writer.add_attachment(0, 0, "notes", "text/plain", b"of another tool")
+        channel = writer.register_channel("/raw/uwb/in", "application/octet-stream", 0)
+        for record in records:
+            writer.add_message(channel, record.stamp_ns, record.data, record.stamp_ns)
+        writer.finish()  # type: ignore[no-untyped-call]
+    log = Log(tmp_path / "chunked.mcap")
+    assert list(log) == records
+    assert (log.config_toml, log.start_ns, log.complete) == (plain.config_toml, 42, True)
+
+
+@pytest.mark.parametrize("length", [0, 10**4, 2**62])
+def test_a_record_with_a_damaged_length_ends_the_log(tmp_path: Path, length: int) -> None:
+    records = [RawChunk("uwb", Direction.IN, i, bytes([65 + i]) * 20) for i in range(9)]
+    path = tmp_path / "a.mcap"
+    write(path, records)
+    content = bytearray(path.read_bytes())
+    # A message is its opcode, its length (8), 22 bytes of head, and its data.
+    at = content.index(b"F" * 20) - 22 - 8
+    content[at : at + 8] = length.to_bytes(8, "little")
+    path.write_bytes(content)
+    log = Log(path)
+    assert list(log) == records[:5]
+    assert not log.complete
 
 
 @pytest.mark.parametrize("content", [b"", b"MCAP", b"not an mcap file at all, but long enough to be one"])

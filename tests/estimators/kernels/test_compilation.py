@@ -5,11 +5,10 @@ import subprocess
 import sys
 from pathlib import Path
 
-from estimators.kernels import cloud, likelihood, motion, posterior, scan
+from estimators.kernels import cloud, likelihood, motion, posterior, scan, scan_fit, scan_lines
 
-COMPILED = [
-    getattr(module, name) for module in (cloud, likelihood, motion, posterior, scan) for name in dir(module)
-]
+MODULES = (cloud, likelihood, motion, posterior, scan, scan_fit, scan_lines)
+COMPILED = [getattr(module, name) for module in MODULES for name in dir(module)]
 
 
 def test_neither_the_command_line_nor_the_table_of_estimators_loads_numba() -> None:

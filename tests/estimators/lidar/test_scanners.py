@@ -113,4 +113,4 @@ def test_modes_of_a_clamped_bar_have_the_variance_of_motion_between_known_ends()
     # Covariance of the Gaussian process between two known poses and velocities: (s (1 - s))**3 / 3.
     shares = np.linspace(0.0, 1.0, 41)
     variance = (clamped_bar(shares) ** 2).sum(axis=0)
-    np.testing.assert_allclose(variance, (shares * (1.0 - shares)) ** 3 / 3.0, atol=0.01 / 192.0)
+    np.testing.assert_allclose(variance, (shares * (1.0 - shares)) ** 3 / 3.0, atol=0.03 / 192.0)
