@@ -2,6 +2,7 @@
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from math import sqrt
 from typing import ClassVar
 
 import numpy as np
@@ -47,6 +48,14 @@ class TagFix:
         cov = self.cov.copy()
         cov[: self.dimensions, : self.dimensions] *= self.disagreement
         return cov
+
+    @property
+    def common_sigma(self) -> float:
+        """What disagreement adds to the standard deviation along x and y [m].
+
+        What blocks a range stays for a while, so the positions of that while have this error in common.
+        """
+        return sqrt((self.disagreement - 1.0) * float(np.trace(self.cov[:2, :2])) / 2.0)
 
 
 class FrameSolver(ABC):
