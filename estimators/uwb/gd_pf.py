@@ -72,7 +72,7 @@ class GdPf:
         return self._fix if self._stamp_ns is not None else None
 
     def update(self, measurement: Measurement) -> Report:
-        """Solve a RangeFrame and move the particles to it; other measurements are not used."""
+        """Solve a RangeFrame of the one tag and move the particles to it; other measurements are not used."""
         before = self._solver.fix
         report = self._solver.update(measurement)
         solved = self._solver.fix
