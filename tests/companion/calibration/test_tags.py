@@ -18,6 +18,7 @@ from companion.errors import UserError
 from companion.importers.sources import import_log
 from companion.log import Log, RawChunk
 from companion.log_trial import run_records
+from companion.smooth import SMOOTHED, smooth_log
 from estimators.messages import RangeFrame
 from tests.strategies import range_frame
 
@@ -61,6 +62,16 @@ def test_a_user_gets_position_and_heading_of_three_tags_by_commands(folder: Path
     assert after.max_m < 0.25
     assert after.yaw_rmse_deg is not None
     assert after.yaw_rmse_deg < 8.0
+
+
+def test_a_smoothed_log_has_the_heading_of_three_tags_too(folder: Path) -> None:
+    import_log(folder, folder / "smooth.mcap", SITE)
+    found = smooth_log(Log(folder / "smooth.mcap"), load_config(SITE), find_anchors=False, find_biases=True)
+    accuracy = found.replay.accuracy(SMOOTHED)
+    assert accuracy is not None
+    assert accuracy.rmse < 0.06
+    assert accuracy.yaw_rmse_deg is not None
+    assert accuracy.yaw_rmse_deg < 8.0
 
 
 def test_one_tag_alone_comes_without_a_heading(folder: Path) -> None:

@@ -238,6 +238,18 @@ def test_it_begins_at_the_start_and_a_blocked_first_range_hardly_matters() -> No
     assert first[0] < 0.2 < first[1]
 
 
+def test_the_start_is_that_of_the_body_not_of_the_tag() -> None:
+    level = Attitude(0, np.array([1.0, 0.0, 0.0, 0.0]))
+    tag = np.array([*(START.pose[:2] + rotation(START.pose[2]) @ ROOM.tag_in_body[:2]), 0.6])
+    estimator = plain()
+    estimator.update(level)
+    slants = [float(np.linalg.norm(anchor - tag)) for anchor in ROOM.anchors.values()]
+    estimator.update(range_frame(0, list(ROOM.anchors), slants))
+    pose = estimator.pose_at(0)
+    assert pose is not None
+    np.testing.assert_allclose([*pose.xy, pose.yaw], START.pose, atol=1e-6)
+
+
 def test_long_silence_places_it_anew() -> None:
     circle = Circle(0)
     estimator = plain()
