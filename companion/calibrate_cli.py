@@ -58,7 +58,8 @@ def ranges(
 
     All later runs and replays with that file take the bias off. A point file has the columns begin, end (of
     the stay, in seconds since the log began), x, y, z (of the tag's antenna, in metres). The site file
-    keeps its comments and its order.
+    keeps its comments and its order. Of several tags on the robot (body.tags) truth calibrates all, points
+    and lidar the one at body.tag.
     """
     import numpy as np
 
@@ -67,11 +68,15 @@ def ranges(
     from companion.calibration.recording import read_recording
     from companion.calibration.reference import tags_from_points, tags_from_truth
     from companion.calibration.site_file import write_range_bias
+    from companion.calibration.tags import TagBias, fit_tags, without_tag_bias
     from companion.config import load_config
     from companion.log import Log
 
     config = load_config(site)
-    recording = read_recording(Log(log), config, until, with_odometry=against == "lidar")
+    recording = read_recording(
+        Log(log), config, until, with_odometry=against == "lidar", every_tag=against == "truth"
+    )
+    of_tags: dict[int, TagBias] = {}
     if against == "lidar":
         from companion.calibration.drive import calibrate_on_drive
 
@@ -82,7 +87,9 @@ def ranges(
         else:
             tags = tags_from_points(Path(against), recording)
         anchors = {i: np.array(position) for i, position in config.anchors.items()}
-        by_anchor = ranges_by_anchor(recording.range_frames, tags, anchors, recording.start_ns)
+        of_tags = fit_tags(recording.range_frames, tags, anchors, recording.start_ns)
+        frames = [without_tag_bias(frame, of_tags) for frame in recording.range_frames]
+        by_anchor = ranges_by_anchor(frames, tags, anchors, recording.start_ns)
         if not by_anchor:
             raise UserError(f"{log}: no anchor has enough ranges where the position is known")
         found = fit_biases(by_anchor)
@@ -100,11 +107,14 @@ def ranges(
         err.print(f"  picture {picture}")
         err.print("[red]nothing written: without known positions one hidden anchor spoils the bias of all[/]")
         raise typer.Exit(1)
-    write_range_bias(site, found, to or site)
+    write_range_bias(site, found, of_tags, to or site)
     out.print(f"  common bias {found.common:+.4f} +- {found.common_sigma:.4f} m, {found.common_ns:+.2f} ns")
+    for tag_id, bias in of_tags.items():
+        out.print(f"  tag {tag_id} beyond that {bias.constant:+.4f} +- {bias.sigma:.4f} m")
     out.print(f"  written to {to or site}, table range_bias", soft_wrap=True)
     out.print(f"  picture {picture}", soft_wrap=True)
-    _write_json(figures, _range_figures(found))
+    by_tag = {str(i): {"bias_m": bias.constant, "bias_sigma_m": bias.sigma} for i, bias in of_tags.items()}
+    _write_json(figures, _range_figures(found) | {"tags": by_tag})
 
 
 @app.command()

@@ -89,6 +89,9 @@ class BodyTable(Table):
     tag: tuple[Coordinate, Coordinate, Coordinate] = Field(
         (0.0, 0.0, 0.0), description="UWB tag antenna in the body frame [m]"
     )
+    tags: dict[int, tuple[Coordinate, Coordinate, Coordinate]] = Field(
+        {}, description="likewise of further tags on the robot, by the id of the tag [m]"
+    )
     lidar: tuple[Coordinate, Coordinate] = Field(
         (0.0, 0.0), description="LiDAR's rotation centre in the body frame [m]"
     )
@@ -140,12 +143,20 @@ class AnchorBiasTable(Table):
     distance: float = Field(0.0, ge=0, le=1000, description="where `constant` holds [m]")
 
 
+class TagBiasTable(Table):
+    """How much longer than the others' one tag's ranges are, as `companion calibrate ranges` found."""
+
+    constant: float = Field(0.0, ge=-10, le=10, description="to every anchor [m]")
+    constant_sigma: float = Field(0.0, ge=0, le=10, description="standard deviation of it [m]")
+
+
 class RangeBiasTable(Table):
     """What is taken off every range before anything else uses it."""
 
     common: float = Field(0.0, ge=-10, le=10, description="of all anchors: c times the time bias [m]")
     common_sigma: float = Field(0.0, ge=0, le=10, description="standard deviation of it [m]")
     anchors: dict[int, AnchorBiasTable] = Field({}, description="by the id of the anchor")
+    tags: dict[int, TagBiasTable] = Field({}, description="by the id of the tag, where the robot has several")
 
 
 class SensorTable(Table):
@@ -349,18 +360,23 @@ class Config(Table):
             lidar_in_body=self.lidar_mounting(),
             floor_map=self.site.map.floor_map() if self.site.map is not None else None,
             scan_preparation=self.scan_preparation,
+            tags={i: np.array(position) for i, position in body.tags.items()},
         )
 
     def range_biases(self) -> dict[int, RangeBias]:
         """Bias by anchor id; empty when none is known."""
         table = self.range_bias
-        if not table.common and not table.anchors:
+        if not table.common and not table.anchors and not table.tags:
             return {}
         single = {i: table.anchors.get(i, AnchorBiasTable()) for i in self.anchors}
         return {
             i: RangeBias(table.common + bias.constant, bias.per_metre, bias.distance)
             for i, bias in single.items()
         }
+
+    def tag_biases(self) -> dict[int, float]:
+        """What ranges of a tag have beyond those of the anchors, by tag id [m]."""
+        return {i: bias.constant for i, bias in self.range_bias.tags.items()}
 
     def lidar_mounting(self) -> FloatArray:
         """`T_body_lidar`, (3,): x [m], y [m], yaw [rad] in the body frame."""

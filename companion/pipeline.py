@@ -145,7 +145,7 @@ class Chain:
         self._primary = primary
         self._watched = watched
         self._monitor = make_monitor(config, self.sensors)
-        self._range_biases = config.range_biases()
+        self._range_biases, self._tag_biases = config.range_biases(), config.tag_biases()
         self._start_ns = start_ns
         self._period_ns = 1e9 / config.pipeline.rate
         self._ticks = 0
@@ -181,7 +181,7 @@ class Chain:
             for measurement in decoder.feed(chunk.data, chunk.stamp_ns):
                 # Here once, so that logs stay as measured and replay takes off what it is told to.
                 if isinstance(measurement, RangeFrame):
-                    measurement = without_bias(measurement, self._range_biases)
+                    measurement = without_bias(measurement, self._range_biases, self._tag_biases)
                 self.sequencer.push(measurement)
 
     def set_health(self, table: HealthTable) -> None:

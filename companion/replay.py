@@ -5,6 +5,7 @@ import time
 from collections import Counter, defaultdict
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
+from math import isinf
 from pathlib import Path
 from statistics import fmean
 
@@ -118,6 +119,10 @@ class Replay:
     def accuracy(self, name: str) -> Accuracy | None:
         """Figures of one estimator; None without truth or poses."""
         return self.errors[name].accuracy() if name in self.errors else None
+
+    def without_height(self, name: str) -> int:
+        """How many poses of one estimator have a height that its ranges could not show: it is the site's."""
+        return sum(isinf(pose.cov[2, 2]) for pose in self.poses[name])
 
 
 def config_of(log: Log, sets: list[str]) -> Config:
@@ -250,6 +255,8 @@ def summary(result: Replay) -> dict[str, object]:
     estimators = {
         name: {
             "accuracy": asdict(accuracy) if (accuracy := result.accuracy(name)) else None,
+            "poses": len(result.poses[name]),
+            "poses_without_height": result.without_height(name),
             "update_ms": result.update_times[name].mean_ms,
             "verdicts": dict(result.verdicts[name]),
             "anchors": {str(i): dict(counts) for i, counts in sorted(result.anchor_verdicts[name].items())},

@@ -82,7 +82,7 @@ def smooth_log(
     noise = Noise(settings.range_sigma, settings.accel_noise, settings.yaw_accel_noise)
     setup = config.setup()
     try:
-        recording = Recording(measurements, setup, noise, {})
+        recording = Recording(measurements, setup, noise, setup.tags)
         smoothed = smooth(
             recording,
             _interpolated(log, result.poses[names[-1]]),

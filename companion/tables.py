@@ -59,5 +59,10 @@ def sensor_lines(result: Replay) -> list[str]:
     ]
     verdicts = result.verdicts[result.names[0]]
     counted = ", ".join(f"{verdicts[v]} {v}" for v in Verdict if verdicts[v])
+    lines += [
+        f"{name}: height unobservable in {count} of {len(result.poses[name])} poses; the site's is kept"
+        for name in result.names
+        if (count := result.without_height(name))
+    ]
     lines.append(f"{result.names[0]}: ranges and increments: {counted or 'none'}; {result.late} late")
     return lines

@@ -20,7 +20,7 @@ ESTIMATORS: dict[str, tuple[str, str]] = {
     "pf_ibas": ("estimators.pf_ibas", "PfIbas"),
     "pf_ibas_graph": ("estimators.graph.pf_ibas_graph", "PfIbasGraph"),
     "pf_ibas_printed": ("estimators.pf_ibas", "PrintedPfIbas"),
-    "uwb_imu_adaptive_ekf": ("estimators.uwb.uwb_imu_ekf", "UwbImuAdaptiveEkf"),
+    "uwb_imu_adaptive_ekf": ("estimators.uwb.uwb_imu_adaptive_ekf", "UwbImuAdaptiveEkf"),
     "uwb_imu_ekf": ("estimators.uwb.uwb_imu_ekf", "UwbImuEkf"),
 }
 """Name on the command line -> module and class. The class has a nested pydantic `Config`."""

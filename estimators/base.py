@@ -105,7 +105,7 @@ class Setup:
 
     Attributes:
         anchors: anchor id -> position (3,) [m], map frame.
-        tag_in_body: (3,) tag antenna in the body frame [m].
+        tag_in_body: (3,) tag antenna in the body frame [m], of every tag that `tags` does not name.
         start: pose at the start.
         height: height of the body origin above the map's floor [m].
         height_sigma: standard deviation of `height` [m].
@@ -115,6 +115,7 @@ class Setup:
         lidar_in_body: (3,) x [m], y [m], yaw [rad] of the LiDAR in the body frame.
         floor_map: made on an earlier visit, with at least one obstacle; None without.
         scan_preparation: what is done with scans beforehand.
+        tags: tag id -> antenna (3,) in the body frame [m], of further tags on the same robot.
     """
 
     anchors: dict[int, FloatArray]
@@ -128,6 +129,11 @@ class Setup:
     lidar_in_body: FloatArray = field(default_factory=lambda: np.zeros(3))
     floor_map: FloorMap | None = None
     scan_preparation: ScanPreparation.Config = field(default_factory=ScanPreparation.Config)
+    tags: dict[int, FloatArray] = field(default_factory=dict)
+
+    def arm(self, tag_id: int) -> FloatArray:
+        """Antenna of a tag in the body frame, (3,) [m]."""
+        return self.tags.get(tag_id, self.tag_in_body)
 
     def height_to(self, anchor: FloatArray) -> float:
         """Height of an anchor above the tag [m]."""

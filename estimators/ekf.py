@@ -45,7 +45,7 @@ class Ekf(FixTaker, LidarOdometry):
                 continue
             measured, sigma = candidate.measured, candidate.sigma
             predicted, by_pose = horizontal_range(
-                self._filter.x[POSE], candidate.anchor, self._setup.tag_in_body
+                self._filter.x[POSE], candidate.anchor, self._setup.arm(frame.tag_id)
             )
             H = np.zeros((1, 9))
             H[0, POSE] = by_pose

@@ -50,9 +50,11 @@ class LeastSquares:
         self._newest_ns: int | None = None
 
     def update(self, measurement: Measurement) -> Report:
-        """Solve a RangeFrame; other measurements are not used."""
+        """Solve a RangeFrame of the one tag; other measurements are not used."""
         if not isinstance(measurement, RangeFrame):
             return Report((Verdict.NOT_USED,))
+        if measurement.tag_id in self._setup.tags:
+            return Report((Verdict.NOT_USED,) * len(measurement.ranges))
         if self._newest_ns is not None and measurement.stamp_ns < self._newest_ns:
             return Report((Verdict.LATE,) * len(measurement.ranges))
         self._newest_ns = measurement.stamp_ns

@@ -164,8 +164,9 @@ class ParticleCloud(FixTaker):
                 candidates[i] = item
         if not candidates:
             return Report(tuple(verdicts), innovations, nis)
+        arm = self._setup.arm(frame.tag_id)
         ranges = np.array([(c.anchor[0], c.anchor[1], c.measured, c.sigma) for c in candidates.values()])
-        mean, cov = self._likelihood.expected_residuals(self._particles, self._weights, self._arm, ranges)
+        mean, cov = self._likelihood.expected_residuals(self._particles, self._weights, arm, ranges)
         for k, (i, candidate) in enumerate(candidates.items()):
             innovations[i] = mean[k]
             nis[i] = mean[k] ** 2 / (cov[k, k] + candidate.sigma**2)
@@ -178,7 +179,7 @@ class ParticleCloud(FixTaker):
             gain = cov[:, k] / (cov[k, k] + ranges[k, 3] ** 2)
             mean, cov = mean - gain * mean[k], cov - np.outer(gain, cov[k])
         if any(verdict.is_used for verdict in verdicts):
-            fixes = Fixes(self._likelihood.misfits, self._arm, ranges, _NO_LANDMARKS)
+            fixes = Fixes(self._likelihood.misfits, arm, ranges, _NO_LANDMARKS)
             self._take(fixes(self._particles), fixes)
         return Report(tuple(verdicts), innovations, nis)
 

@@ -60,15 +60,17 @@ class HorizontalRanges:
     def __init__(self, sigma: float, setup: Setup) -> None:
         self._sigma = sigma
         self._anchors = {i: (anchor, setup.height_to(anchor)) for i, anchor in setup.anchors.items()}
+        self._lifts = {i: float(arm[2] - setup.tag_in_body[2]) for i, arm in setup.tags.items()}
 
     def of(self, frame: RangeFrame) -> Iterator[Verdict | tuple[FloatArray, float, float]]:
         """For each range of a frame the anchor (3,), horizontal range and its sigma [m], or what is wrong."""
+        lift = self._lifts.get(frame.tag_id, 0.0)
         for anchor_id, slant in zip(frame.anchor_ids.tolist(), frame.ranges.tolist(), strict=True):
             if anchor_id not in self._anchors:
                 yield Verdict.UNKNOWN_ANCHOR
                 continue
             anchor, height = self._anchors[anchor_id]
-            reduced = reduce_height(slant, self._sigma, height)
+            reduced = reduce_height(slant, self._sigma, height - lift)
             yield Verdict.IMPOSSIBLE if reduced is None else (anchor, *reduced)
 
 

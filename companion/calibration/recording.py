@@ -27,7 +27,9 @@ class Recording:
     truths: list[Truth]
 
 
-def read_recording(log: Log, config: Config, until: float | None, with_odometry: bool) -> Recording:
+def read_recording(
+    log: Log, config: Config, until: float | None, *, with_odometry: bool, every_tag: bool = False
+) -> Recording:
     """Decode a log.
 
     Args:
@@ -35,6 +37,7 @@ def read_recording(log: Log, config: Config, until: float | None, with_odometry:
         config: of the site.
         until: leave out what arrived later than this after the beginning [s]; None: take all.
         with_odometry: match the scans, too.
+        every_tag: with the ranges of tags in `body.tags`.
 
     Raises:
         UserError: there is no range in it.
@@ -49,7 +52,9 @@ def read_recording(log: Log, config: Config, until: float | None, with_odometry:
                 recording.increments.append(increment)
         elif isinstance(measurement, Truth):
             recording.truths.append(measurement)
-        elif isinstance(measurement, RangeFrame):
+        elif isinstance(measurement, RangeFrame) and (
+            every_tag or measurement.tag_id not in config.body.tags
+        ):
             recording.range_frames.append(measurement)
     if not recording.range_frames:
         raise UserError(f"{log.path}: no ranges of the site's sensors in it")

@@ -10,14 +10,14 @@ from companion.config import Config
 from companion.errors import UserError
 from companion.evaluate import Reference
 from companion.text_file import read_text
-from estimators.geometry import rotation
+from estimators.geometry import transform_each
 from estimators.messages import FloatArray
 
 POINT_COLUMNS = ["begin", "end", "x", "y", "z"]
 
 
 def tags_from_truth(recording: Recording, config: Config) -> FloatArray:
-    """Positions (N, 3) [m] of the tag at the range frames, from the poses that the log holds as truth.
+    """Positions (N, 3) [m] of each range frame's tag, from the poses that the log holds as truth.
 
     Raises:
         UserError: there is no truth, or it lacks the heading that the tag's place on the robot needs.
@@ -27,12 +27,13 @@ def tags_from_truth(recording: Recording, config: Config) -> FloatArray:
     reference = Reference(recording.truths)
     stamps = [frame.stamp_ns for frame in recording.range_frames]
     poses = reference.at(stamps)
-    arm = np.array(config.body.tag)
-    tags = np.column_stack([poses[:, :2], np.full(len(poses), config.body.height + arm[2])])
-    if arm[:2].any():
+    setup = config.setup()
+    arms = np.array([setup.arm(frame.tag_id) for frame in recording.range_frames])
+    tags = np.column_stack([poses[:, :2], config.body.height + arms[:, 2]])
+    if arms[:, :2].any():
         if not np.isfinite(poses[:, 2]).all():
             raise UserError("--against truth: it has no heading, and body.tag is not at the body's origin")
-        tags[:, :2] += [rotation(yaw) @ arm[:2] for yaw in poses[:, 2].tolist()]
+        tags[:, :2] = transform_each(poses, arms[:, :2])
     tags[[not reference.covers(stamp_ns) for stamp_ns in stamps]] = np.nan
     return tags
 

@@ -1,5 +1,6 @@
 """Calibrated values written into a site file; comments and order stay."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -7,17 +8,19 @@ import tomlkit
 from tomlkit.items import Table
 
 from companion.calibration.ranges import Calibration
+from companion.calibration.tags import TagBias
 from companion.config import config_from_toml
 from companion.errors import UserError
 from companion.text_file import read_text
 
 
-def write_range_bias(site: Path, calibration: Calibration, to: Path) -> None:
+def write_range_bias(site: Path, calibration: Calibration, tags: Mapping[int, TagBias], to: Path) -> None:
     """Put a calibration into the table `[range_bias]` of a site file.
 
     Args:
         site: file to read.
         calibration: what to write.
+        tags: tag id -> bias beyond it.
         to: file to write; may be the same.
 
     Raises:
@@ -36,6 +39,13 @@ def write_range_bias(site: Path, calibration: Calibration, to: Path) -> None:
         row["per_metre_sigma"] = round(fit.per_metre_sigma, 5)
         row["distance"] = round(fit.bias.distance, 3)
         anchors[str(anchor_id)] = row
+    if tags:
+        of_tags = _table(table, "tags")
+        for tag_id, bias in tags.items():
+            row = tomlkit.inline_table()
+            row["constant"] = round(bias.constant, 4)
+            row["constant_sigma"] = round(bias.sigma, 4)
+            of_tags[str(tag_id)] = row
     text = tomlkit.dumps(document)
     config_from_toml(text, str(to), folder=to.parent)
     try:

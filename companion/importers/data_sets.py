@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from companion.config import Config
 from companion.errors import UserError
 from companion.importers.recording import Recording
 from companion.importers.tables import nanoseconds, numbers, rows, single_range
@@ -21,8 +22,9 @@ _LIAS_RANGES, _LIAS_MOTION = "UWB_dynamic_exp_fast.csv", "motion_capture_dynamic
 _LIAS_TAG, _LIAS_TAGS, _LIAS_ANCHORS = 0, 3, 8
 _LIAS_TAG_IN_TROLLEY = np.array([[-0.0689, -0.1423]])
 _LIAS_YAW_OFFSET = np.deg2rad(7.0)
-_LIAS_CLOCK_OFFSET_NS = 10_000_000
-"""UWB clock ahead of the motion capture's: 7, 4 and 18 ms by the ranges of tags 0, 1, 2 in the first 30 s."""
+_LIAS_CLOCK_OFFSET_NS = 5_000_000
+"""UWB clock ahead of the motion capture's: 5.0 +- 3.2 ms by the ranges of all tags in the first 30 s,
+3.1 +- 3.7 ms by the whole drive; what depends on the direction to the anchor was fitted along with it."""
 _LABYRINTH_MEASURED, _LABYRINTH_TRUTH = "Indoor_UWB_Input.txt", "Indoor_UWB_GT.txt"
 _ROBOTINO_TRUTH = "_ref_scanmatch.csv"
 _ROBOTINO_BIAS = {177: 0.611, 178: -0.043, 180: -0.607}
@@ -30,25 +32,32 @@ _ROBOTINO_BIAS = {177: 0.611, 178: -0.043, 180: -0.607}
 _ROBOTINO_FIRST_BEAM, _ROBOTINO_STEP, _ROBOTINO_SCAN_S = -2.3562, 0.005817, 1.0 / 15.0
 
 
-def lias_planar(folder: Path) -> Recording:
-    """LIAS-CUHKSZ, ICRA 2023: tag 0 of a trolley among eight anchors at 100 Hz; truth of the tag's position.
+def lias_planar(folder: Path, config: Config) -> Recording:
+    """LIAS-CUHKSZ, ICRA 2023: a trolley among eight anchors at 100 Hz.
+
+    Where the site names further tags on the robot, it gives the ranges of all three and the trolley's pose as
+    truth, else those of tag 0 and that tag's position.
 
     Source: github.com/LIAS-CUHKSZ/Efficient-Pose-Estimation-via-UWB-measurements.
     """
     recording = Recording()
     path = folder / _LIAS_RANGES
     for cells in rows(path, 1 + _LIAS_ANCHORS * _LIAS_TAGS, header=False):
-        ranges = np.array(numbers(path, cells[1:])).reshape(_LIAS_ANCHORS, _LIAS_TAGS)[:, _LIAS_TAG]
-        ids = np.flatnonzero(ranges > 0.0)
-        none = np.full(len(ids), np.nan)
-        recording.ranges.append(RangeFrame(_lias_ns(cells[0]), _LIAS_TAG, ids, ranges[ids], none, none))
+        by_tag = np.array(numbers(path, cells[1:])).reshape(_LIAS_ANCHORS, _LIAS_TAGS).T
+        for tag_id in {_LIAS_TAG, *config.body.tags}:
+            ids = np.flatnonzero(by_tag[tag_id] > 0.0)
+            none = np.full(len(ids), np.nan)
+            ranges = by_tag[tag_id, ids]
+            recording.ranges.append(RangeFrame(_lias_ns(cells[0]), tag_id, ids, ranges, none, none))
     path = folder / _LIAS_MOTION
     for cells in rows(path, 8):
         x, y, _, qw, qx, qy, qz = numbers(path, cells[1:8])
         # The tracked body hangs upside down.
         yaw = float(Rotation.from_quat([qx, qy, qz, qw]).as_euler("ZYX")[0]) + _LIAS_YAW_OFFSET
-        tag = transform(np.array([x, y, yaw]), _LIAS_TAG_IN_TROLLEY)[0]
-        recording.truths.append(Truth(_lias_ns(cells[0]) + _LIAS_CLOCK_OFFSET_NS, np.array([*tag, np.nan])))
+        pose = np.array([x, y, yaw])
+        if not config.body.tags:
+            pose = np.array([*transform(pose, _LIAS_TAG_IN_TROLLEY)[0], np.nan])
+        recording.truths.append(Truth(_lias_ns(cells[0]) + _LIAS_CLOCK_OFFSET_NS, pose))
     return recording
 
 
@@ -57,7 +66,7 @@ def _lias_ns(text: str) -> int:
     return round(since.total_seconds() * 1e6) * 1000
 
 
-def labyrinth_uwb(folder: Path) -> Recording:
+def labyrinth_uwb(folder: Path, config: Config) -> Recording:  # noqa: ARG001
     """TU Chemnitz, Labyrinth: a small robot, one range a row to four anchors; wheel speeds are not taken.
 
     Source: github.com/TUC-ProAut/libRSF.
@@ -75,7 +84,7 @@ def labyrinth_uwb(folder: Path) -> Recording:
     return recording
 
 
-def robotino_uwb(folder: Path) -> Recording:
+def robotino_uwb(folder: Path, config: Config) -> Recording:  # noqa: ARG001
     """Robotino, 2017: scans of 270 deg at 15 Hz and single ranges to three anchors; odometry is not taken.
 
     The reference is scan matching to a map: not independent of the scans.
@@ -117,7 +126,7 @@ def _robotino_truth(folder: Path) -> Path:
     return found[0]
 
 
-DATA_SETS: dict[str, tuple[str, Callable[[Path], Recording]]] = {
+DATA_SETS: dict[str, tuple[str, Callable[[Path, Config], Recording]]] = {
     "lias_planar": (_LIAS_RANGES, lias_planar),
     "labyrinth_uwb": (_LABYRINTH_MEASURED, labyrinth_uwb),
     "robotino_uwb": (f"*{_ROBOTINO_TRUTH}", robotino_uwb),

@@ -42,13 +42,16 @@ def write_recording(recording: Recording, config: Config, path: Path) -> int:
     Raises:
         UserError: the site has no sensor for what was measured, nothing was, or the log cannot be written.
     """
-    frames = [(m.stamp_ns, _range_bytes(m)) for m in recording.ranges]
-    frames += [(m.stamp_ns, _inertial_bytes(m)) for m in recording.inertial]
+    by_tag: dict[int | None, list[tuple[int, bytes]]] = {}
+    for m in recording.ranges:
+        by_tag.setdefault(m.tag_id, []).append((m.stamp_ns, _range_bytes(m)))
+    if recording.inertial:
+        by_tag[None] = [(m.stamp_ns, _inertial_bytes(m)) for m in recording.inertial]
     scans = sorted(recording.scans, key=lambda scan: scan.stamp_ns)
     scans = [scan for scan in scans if len(scan.angles) >= _LEAST_BEAMS]
     records: list[RawChunk | Truth] = list(recording.truths)
-    if frames:
-        name, latency_ns = _sensor(config, "linktrack")
+    for tag_id, frames in by_tag.items():
+        name, latency_ns = _sensor(config, "linktrack", tag_id)
         records += _chunks(name, ((stamp_ns + latency_ns, data) for stamp_ns, data in frames))
     if scans:
         name, latency_ns = _sensor(config, "rplidar")
@@ -60,17 +63,21 @@ def write_recording(recording: Recording, config: Config, path: Path) -> int:
         raise UserError(f"cannot write {path}: the recording holds no range, scan or inertial sample")
     records.sort(key=lambda record: record.stamp_ns)
     write_log(path, config, min(measured), records)
-    return len(frames) + len(scans)
+    return len(recording.ranges) + len(recording.inertial) + len(scans)
 
 
-def _sensor(config: Config, driver: str) -> tuple[str, int]:
-    """Name of the site's first sensor with a driver, and by how much that takes stamps back [ns]."""
-    for name, table in config.sensor.items():
-        if table.driver == driver:
-            return name, round(table.settings.latency_ms * 1e6)
-    raise UserError(
-        f"the site {config.site.name!r} has no sensor with driver {driver!r}, which is needed here"
-    )
+def _sensor(config: Config, driver: str, tag_id: int | None = None) -> tuple[str, int]:
+    """Name of the site's sensor with a driver, and by how much that takes stamps back [ns].
+
+    Of several the one that is set to take that tag alone, else the first.
+    """
+    own = [(name, table.settings) for name, table in config.sensor.items() if table.driver == driver]
+    if not own:
+        raise UserError(
+            f"the site {config.site.name!r} has no sensor with driver {driver!r}, which is needed here"
+        )
+    name, settings = min(own, key=lambda sensor: getattr(sensor[1], "tag_id", None) != tag_id)
+    return name, round(settings.latency_ms * 1e6)
 
 
 def _chunks(name: str, packets: Iterable[tuple[int, bytes]]) -> list[RawChunk]:

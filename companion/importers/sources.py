@@ -43,12 +43,12 @@ def import_log(
             raise UserError(f"{source}: give --site FILE, the recording does not say where its anchors stand")
         site = params_dir() / "sites" / f"{name}.toml"
     config: Config = load_config(site, sets or [])
-    return write_recording(_read(source, name, truth), config, path)
+    return write_recording(_read(source, name, config, truth), config, path)
 
 
-def _read(source: Path, name: str | None, truth: str | None) -> Recording:
+def _read(source: Path, name: str | None, config: Config, truth: str | None) -> Recording:
     if name is not None:
-        return DATA_SETS[name][1](source)
+        return DATA_SETS[name][1](source, config)
     if source.suffix in _CARMEN:
         return read_carmen(source)
     if source.suffix in _BAGS or (source / _ROS2_FOLDER).exists():

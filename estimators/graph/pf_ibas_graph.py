@@ -51,7 +51,11 @@ class PfIbasGraph(GraphSmoother):
         if not isinstance(frame, RangeFrame) or Verdict.LATE in self._said.verdicts:
             return super()._judge(frame, mean, cov)
         rows = self._judging.believed_ranges(
-            self._horizontal, frame, self._said.verdicts, self._setup.tag_in_body, self._anchor_numbers
+            self._horizontal,
+            frame,
+            self._said.verdicts,
+            self._setup.arm(frame.tag_id),
+            self._anchor_numbers,
         )
         return self._taken(frame.stamp_ns, "ranges", rows, self._said)
 

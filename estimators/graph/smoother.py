@@ -160,7 +160,7 @@ class GraphSmoother(KeyframeTracker):
         belief = self._judging.Belief(mean[STATE], cov[STATE, STATE])
         if isinstance(frame, RangeFrame):
             report, rows = self._judging.judge_ranges(
-                self._gate, frame, belief, self._setup.tag_in_body, self._anchor_numbers
+                self._gate, frame, belief, self._setup.arm(frame.tag_id), self._anchor_numbers
             )
             table = "ranges"
         else:

@@ -85,7 +85,7 @@ class Recovering:
         self._config = config
         self._period_ns = round(config.period * 1e9)
         self._starts_known = setup.start.known
-        self._window = Window(config.window, HorizontalRanges(range_sigma, setup), setup.tag_in_body)
+        self._window = Window(config.window, HorizontalRanges(range_sigma, setup), setup)
         floor = setup.floor_map
         self._map: MapSearch | None = None
         if floor is not None and floor.occupied.size <= MOST_CELLS:

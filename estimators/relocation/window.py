@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from estimators.base import Verdict
+from estimators.base import Setup, Verdict
 from estimators.geometry import compose, inverse, transform, transform_each, wrap_angle
 from estimators.lidar.keyframes import is_covariance
 from estimators.messages import FloatArray, IntArray, PoseIncrement, RangeFrame
@@ -77,19 +77,19 @@ class Window:
     Args:
         length: how far back ranges are kept [s].
         horizontal: reduces ranges to the horizontal.
-        tag_in_body: (3,) [m].
+        setup: geometry of the site; tells where tags sit.
     """
 
-    def __init__(self, length: float, horizontal: HorizontalRanges, tag_in_body: FloatArray) -> None:
+    def __init__(self, length: float, horizontal: HorizontalRanges, setup: Setup) -> None:
         self._length_ns = round(length * 1e9)
         self._horizontal = horizontal
-        self._arm = tag_in_body[None, :2]
+        self._setup = setup
         self.clear()
 
     def clear(self) -> None:
         """Forget everything."""
         self._newest_ns: int | None = None
-        self._waiting: deque[tuple[int, FloatArray]] = deque()
+        self._waiting: deque[tuple[int, FloatArray, FloatArray]] = deque()
         self._break_off()
 
     def _break_off(self) -> None:
@@ -122,7 +122,7 @@ class Window:
                 verdicts.append(Verdict.WAITING)
                 rows.append((anchor[0], anchor[1], anchor_id, measured, sigma))
         if rows:
-            self._waiting.append((frame.stamp_ns, np.array(rows)))
+            self._waiting.append((frame.stamp_ns, self._setup.arm(frame.tag_id)[:2], np.array(rows)))
             while self._waiting[0][0] < frame.stamp_ns - self._length_ns:
                 self._waiting.popleft()
         return verdicts
@@ -190,9 +190,10 @@ class Window:
             return
         change = pose - self._last
         change[2] = wrap_angle(change[2])
-        shares = np.array([(at_ns - self._last_ns) / span for at_ns, _ in ranges])
-        tags = transform_each(self._last + shares[:, None] * change, self._arm)
-        for (at_ns, rows), tag in zip(ranges, tags, strict=True):
+        shares = np.array([(at_ns - self._last_ns) / span for at_ns, _, _ in ranges])
+        arms = np.array([arm for _, arm, _ in ranges])
+        tags = transform_each(self._last + shares[:, None] * change, arms)
+        for (at_ns, _, rows), tag in zip(ranges, tags, strict=True):
             self._placed.append(_Placed(at_ns, self._steps_made, tag, rows))
 
     def _forget(self, before_ns: int) -> None:

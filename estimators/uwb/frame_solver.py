@@ -2,6 +2,7 @@
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from math import sqrt
 from typing import ClassVar
 
 import numpy as np
@@ -48,6 +49,14 @@ class TagFix:
         cov[: self.dimensions, : self.dimensions] *= self.disagreement
         return cov
 
+    @property
+    def common_sigma(self) -> float:
+        """What disagreement adds to the standard deviation along x and y [m].
+
+        What blocks a range stays for a while, so the positions of that while have this error in common.
+        """
+        return sqrt((self.disagreement - 1.0) * float(np.trace(self.cov[:2, :2])) / 2.0)
+
 
 class FrameSolver(ABC):
     """Position of every range frame; which solver finds it is the subclass's.
@@ -89,9 +98,11 @@ class FrameSolver(ABC):
         return self._fix
 
     def update(self, measurement: Measurement) -> Report:
-        """Solve a RangeFrame; other measurements are not used."""
+        """Solve a RangeFrame of the one tag; other measurements are not used."""
         if not isinstance(measurement, RangeFrame):
             return Report((Verdict.NOT_USED,))
+        if measurement.tag_id in self._setup.tags:
+            return Report((Verdict.NOT_USED,) * len(measurement.ranges))
         if self._newest_ns is not None and measurement.stamp_ns < self._newest_ns:
             return Report((Verdict.LATE,) * len(measurement.ranges))
         self._newest_ns = measurement.stamp_ns

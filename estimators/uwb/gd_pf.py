@@ -1,6 +1,7 @@
 """Particle filter on solved positions: what momentum gradient descent finds, smoothed by a motion model."""
 
 from dataclasses import replace
+from math import exp
 
 import numpy as np
 from pydantic import Field
@@ -16,8 +17,8 @@ TAIL_FREEDOM = 3.0
 """Degrees of freedom of the Student law of solved positions: a gross error must not decide alone."""
 KEPT_SHARE = 0.1
 """Share of the resampled particles that are drawn whatever their weight."""
-
-
+BLOCKED_TIME = 2.0
+"""What blocks a range stays for about so long [s]."""
 START_SPEED_SIGMA = 0.5
 """Standard deviation of each velocity of a tag that is seen for the first time [m/s]."""
 
@@ -59,15 +60,19 @@ class GdPf:
         self._solver.reset()
         self._rng = np.random.default_rng(self._config.seed)
         self._stamp_ns: int | None = None
+        self._common_sigma = 0.0
         self._reset_counter = -1
 
     @property
     def fix(self) -> TagFix | None:
-        """Mean and covariance of the particles at the newest frame; None before the first."""
+        """Mean and covariance of the particles at the newest frame; None before the first.
+
+        Its disagreement is not the frame's alone: what pulled the particles aside stays in their mean.
+        """
         return self._fix if self._stamp_ns is not None else None
 
     def update(self, measurement: Measurement) -> Report:
-        """Solve a RangeFrame and move the particles to it; other measurements are not used."""
+        """Solve a RangeFrame of the one tag and move the particles to it; other measurements are not used."""
         before = self._solver.fix
         report = self._solver.update(measurement)
         solved = self._solver.fix
@@ -108,7 +113,13 @@ class GdPf:
         position[: len(mean)], cov[: len(mean), : len(mean)] = mean, spread
         if np.isinf(solved.cov[2, 2]):
             cov[2, 2] = np.inf
-        self._fix = replace(solved, position=position, cov=cov)
+        # The mean takes of what a frame errs by the filter's gain. A frame that agrees by chance while
+        # something blocks a range takes nothing of it away.
+        gain = min(1.0, float(np.trace(cov[:2, :2]) / np.trace(solved.widened_cov[:2, :2])))
+        taken = (1.0 - gain) * self._common_sigma + gain * solved.common_sigma
+        self._common_sigma = max(taken, self._common_sigma * exp(-dt / BLOCKED_TIME))
+        disagreement = 1.0 + 2.0 * self._common_sigma**2 / float(np.trace(cov[:2, :2]))
+        self._fix = replace(solved, position=position, cov=cov, disagreement=disagreement)
         self._resample()
 
     def _scatter(self, solved: TagFix) -> None:

@@ -1,4 +1,4 @@
-"""UWB positions and inertial accelerations in a Kalman filter (filterpy), plain and with an adaptive gain.
+"""UWB positions and inertial accelerations in a Kalman filter (filterpy).
 
 State, (9,): position and velocity of the tag and its acceleration in the map, heading of the inertial
 sensor's level frame in the map, and bias of its x and y axes. The sensor is taken to sit at the tag with its
@@ -28,11 +28,13 @@ from estimators.uwb.frame_solver import TagFix
 from estimators.uwb.gd_pf import GdPf
 from estimators.uwb.gradient_descent import MomentumGradientDescent
 
-MOVING, ACCEL, PSI = slice(0, 6), slice(4, 6), 6
+MOVING, ACCEL, PSI, BIAS = slice(0, 6), slice(4, 6), 6, slice(7, 9)
 SPEED_SIGMA, ACCEL_SIGMA, BIAS_SIGMA = 0.5, 1.0, 0.1
 """Standard deviations of velocity [m/s], acceleration and bias [m/s^2] at the beginning, each axis."""
 MAX_HEADING_SIGMA = 0.35
 """A start heading less certain than this [rad] is none: accelerations would be taken in a wrong direction."""
+ANYWHERE_SIGMA = 100.0
+"""Standard deviation of each coordinate of a tag of which nothing is known before its first position [m]."""
 MAX_ATTITUDE_AGE = 0.5
 """An attitude older than this [s] no longer levels samples nor tells a heading."""
 
@@ -45,6 +47,9 @@ class UwbImuEkf:
     Source: li2022, EKF with observation [UWB position, acceleration in the navigation frame]; state,
     Jacobians and noise are lost in the text, those here are ours and tested against finite differences.
     """
+
+    STATES: ClassVar[int] = 9
+    """How many unknowns it has, those of subclasses behind its own."""
 
     class Config(GdPf.Config):
         """Settings of `uwb_imu_ekf`."""
@@ -88,13 +93,14 @@ class UwbImuEkf:
         self._is_placed = False
         self._heading_known = False
         self._reset_counter = -1
-        self._filter = ExtendedKalmanFilter(dim_x=9, dim_z=2)
-        self._filter.x = np.zeros(9)
-        self._filter.P = np.diag([0.0] * 6 + [0.0] + [BIAS_SIGMA**2] * 2)
+        self._filter = ExtendedKalmanFilter(dim_x=self.STATES, dim_z=2)
+        self._filter.x = np.zeros(self.STATES)
+        self._filter.P = np.zeros((self.STATES, self.STATES))
+        self._filter.P[BIAS, BIAS] = np.eye(2) * BIAS_SIGMA**2
 
     @property
     def state(self) -> tuple[FloatArray, FloatArray]:
-        """State (9,) and covariance (9, 9) at the newest measurement, for tests."""
+        """State (N,) and covariance (N, N) at the newest measurement, for tests."""
         return self._filter.x.copy(), self._filter.P.copy()
 
     def update(self, measurement: Measurement) -> Report:
@@ -122,7 +128,7 @@ class UwbImuEkf:
         dt = (stamp_ns - self._stamp_ns) * 1e-9
         F, Q = constant_acceleration(dt, self._config.jerk_noise)
         position = (F @ self._filter.x[MOVING])[:2]
-        to_position = np.zeros((3, 9))
+        to_position = np.zeros((3, self.STATES))
         to_position[:2, MOVING] = F[:2]
         lever = self._setup.tag_in_body[:2]
         R_level_body = self._leveller.matrix(stamp_ns, MAX_ATTITUDE_AGE)
@@ -142,9 +148,11 @@ class UwbImuEkf:
         T_map_body = lift(pose, self._setup.height)
         return PoseEstimate(stamp_ns, T_map_body, self._setup.lift_covariance(planar), self._reset_counter)
 
-    def _scale(self, fix: TagFix) -> float:  # noqa: ARG002
-        """Factor of the covariance of an observed position; constant noise here, as in the paper."""
-        return 1.0
+    def _observation(self, fix: TagFix) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Jacobian (2, N), predicted position (2,) and noise (2, 2) of a fix, constant as in li2022."""
+        H = np.zeros((2, self.STATES))
+        H[:, :2] = np.eye(2)
+        return H, self._filter.x[:2], fix.cov[:2, :2]
 
     def _update_ranges(self, frame: RangeFrame) -> Report:
         before = self._solver.fix
@@ -155,17 +163,21 @@ class UwbImuEkf:
             return report
         if not self._is_placed:
             self._place(fix)
-            return report
-        H = np.zeros((2, 9))
-        H[:, :2] = np.eye(2)
-        self._correct(fix.position[:2], H, self._filter.x[:2], fix.cov[:2, :2] * self._scale(fix))
+        H, predicted, R = self._observation(fix)
+        self._correct(fix.position[:2], H, predicted, R)
         return report
 
     def _place(self, fix: TagFix) -> None:
-        self._filter.x[MOVING] = [*fix.position[:2], 0.0, 0.0, 0.0, 0.0]
+        """Begin at the start, or later and without a start heading where the fix is, which then decides."""
+        start, lever = self._setup.start, self._setup.tag_in_body[:2]
+        if self._reset_counter < 0 and start.sigma[2] <= MAX_HEADING_SIGMA:
+            position = start.pose[:2] + rotation(start.pose[2]) @ lever
+            variance = start.sigma[:2] ** 2 + float(lever @ lever) * start.sigma[2] ** 2
+        else:
+            position, variance = fix.position[:2], np.full(2, ANYWHERE_SIGMA**2)
+        self._filter.x[MOVING] = [*position, 0.0, 0.0, 0.0, 0.0]
         self._filter.P[MOVING, :] = self._filter.P[:, MOVING] = 0.0
-        self._filter.P[:2, :2] = fix.widened_cov[:2, :2]
-        self._filter.P[2:6, 2:6] = np.diag([SPEED_SIGMA**2] * 2 + [ACCEL_SIGMA**2] * 2)
+        self._filter.P[MOVING, MOVING] = np.diag([*variance, *[SPEED_SIGMA**2] * 2, *[ACCEL_SIGMA**2] * 2])
         self._is_placed = True
         self._reset_counter += 1
 
@@ -191,9 +203,9 @@ class UwbImuEkf:
         if R_level_body is None or not self._heading_known or not self._is_placed:
             return Verdict.NOT_USED
         x = self._filter.x
-        predicted, by_state = predicted_acceleration(x[ACCEL], x[PSI], x[7:9], R_level_body)
-        H = np.zeros((2, 9))
-        H[:, ACCEL], H[:, PSI:] = by_state[:, :2], by_state[:, 2:]
+        predicted, by_state = predicted_acceleration(x[ACCEL], x[PSI], x[BIAS], R_level_body)
+        H = np.zeros((2, self.STATES))
+        H[:, ACCEL], H[:, PSI : BIAS.stop] = by_state[:, :2], by_state[:, 2:]
         measured = level_acceleration(R_level_body, sample.accel)
         self._correct(measured, H, predicted, np.eye(2) * self._config.imu_accel_sigma**2)
         return Verdict.ACCEPTED
@@ -204,69 +216,23 @@ class UwbImuEkf:
         if dt > self._config.max_silence:
             # The next position places it anew.
             self._is_placed = False
+        self._filter.F, self._filter.Q = self._motion(dt)
+        self._filter.predict()
+
+    def _motion(self, dt: float) -> tuple[FloatArray, FloatArray]:
+        """Transition (N, N) of the state over a time [s], and its noise (N, N)."""
         config = self._config
-        F, Q = np.eye(9), np.zeros((9, 9))
+        F, Q = np.eye(self.STATES), np.zeros((self.STATES, self.STATES))
         if self._is_placed:
             F[MOVING, MOVING], Q[MOVING, MOVING] = constant_acceleration(dt, config.jerk_noise)
-        walks = [np.deg2rad(config.heading_walk_deg), config.bias_walk, config.bias_walk]
-        Q[PSI:, PSI:] = np.diag(np.square(walks) * dt)
-        self._filter.F, self._filter.Q = F, Q
-        self._filter.predict()
+        Q[PSI, PSI] = np.deg2rad(config.heading_walk_deg) ** 2 * dt
+        Q[BIAS, BIAS] = np.eye(2) * config.bias_walk**2 * dt
+        return F, Q
 
     def _correct(self, measured: FloatArray, H: FloatArray, predicted: FloatArray, R: FloatArray) -> None:
         self._filter.update(measured, lambda _: H, lambda _: predicted, R=R)
         self._filter.x[PSI] = wrap_angle(self._filter.x[PSI])
         self._filter.P = 0.5 * (self._filter.P + self._filter.P.T)
-
-
-class UwbImuAdaptiveEkf(UwbImuEkf):
-    """The same filter, which takes less of positions that cannot be.
-
-    The covariance of an observed position grows with the square of what exceeds either limit, so its gain,
-    and even its pull, fades: where it is further from the predicted position than states and observations may
-    be apart; where it is further from the position observed before than the robot can have come, three
-    standard deviations of both allowed for. It grows, too, where the ranges disagree: what blocks a range
-    stays for a while, so the positions of that while err alike and count as one.
-
-    Source: li2022, adaptive function on the gain, from state-observation distance and from the top speed; its
-    formulas are lost, the factors are ours, and so is that of the disagreement.
-    """
-
-    class Config(UwbImuEkf.Config):
-        """Settings of `uwb_imu_adaptive_ekf`."""
-
-        max_distance: float = Field(
-            0.25, gt=0, le=100, description="state and observed position are at most so far apart [m]"
-        )
-        top_speed: float = Field(1.0, gt=0, le=50, description="of the robot [m/s]")
-        blocked_time: float = Field(
-            2.0, gt=0, le=60, description="positions of ranges that disagree err alike for so long [s]"
-        )
-
-    def __init__(self, config: Config, setup: Setup) -> None:
-        self._limits = config
-        super().__init__(config, setup)
-
-    def reset(self) -> None:
-        """Wait for the first position again."""
-        super().reset()
-        self._observed: TagFix | None = None
-
-    def _place(self, fix: TagFix) -> None:
-        super()._place(fix)
-        self._observed = fix
-
-    def _scale(self, fix: TagFix) -> float:
-        before, self._observed = self._observed, fix
-        assert before is not None
-        apart = float(np.linalg.norm(fix.position[:2] - self._filter.x[:2]))
-        step = float(np.linalg.norm(fix.position[:2] - before.position[:2]))
-        variance = float(np.trace(fix.cov[:2, :2] + before.cov[:2, :2])) / 2.0
-        dt = (fix.stamp_ns - before.stamp_ns) * 1e-9
-        reach = self._limits.top_speed * dt + 3.0 * np.sqrt(variance)
-        too_far = max(1.0, apart / self._limits.max_distance) * max(1.0, step / reach)
-        alike = self._limits.blocked_time / min(max(dt, 1e-3), self._limits.blocked_time)
-        return float(too_far**2 * (1.0 + (fix.disagreement - 1.0) * alike))
 
 
 def _heading(R_level_body: FloatArray) -> float:

@@ -18,7 +18,7 @@ from estimators.base import Verdict
 DATA = Path(__file__).parent.parent / "data" / "lias_planar"
 TAG_IN_TROLLEY = np.array([-0.0750, 0.1402])
 YAW_OFFSET = np.deg2rad(7.0)
-CLOCK_OFFSET_NS = 30_000_000
+CLOCK_OFFSET_NS = 5_000_000
 """UWB clock ahead of the motion capture's."""
 MEASURED_RMSE = 0.172
 """Non-linear least squares on the same kind of frames, as the data set's summary has it [m]."""

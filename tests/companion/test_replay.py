@@ -1,5 +1,6 @@
 """Replay of simulated logs: the figures that the demo shows, and that a replay repeats itself."""
 
+import json
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from itertools import pairwise
@@ -16,10 +17,13 @@ from companion.log import Direction, Log, LogWriter, RawChunk, Truth
 from companion.pipeline import Chain, Tick, make_pipeline
 from companion.replay import Replay, config_of, replay, write_outputs
 from companion.sim.scenario import load_scenario
+from companion.tables import sensor_lines
 from tests.conftest import SCENARIO, write_log
 
 SENSORS_AND_FUSED = ["ekf", "least_squares", "lidar_odometry"]
 SEEDS = (1, 2)
+FLAT = ["[0.15, 0.15, 2.1]", "[0.15, 6.85, 2.1]", "[7.85, 6.85, 2.1]", "[7.85, 0.15, 2.1]"]
+"""The room's anchors, as if they were all at one height."""
 
 
 def run(path: Path, names: list[str], sets: list[str] | None = None) -> Replay:
@@ -105,6 +109,28 @@ def test_other_estimators_beside_it_change_nothing(short_log: Path, tmp_path: Pa
     write_outputs(run(short_log, ["ekf", "least_squares"]), tmp_path / "beside")
     alone, beside = ((tmp_path / name / "poses.tum").read_bytes() for name in ("alone", "beside"))
     assert alone == beside
+
+
+def test_a_height_that_ranges_cannot_show_is_the_sites_and_is_said_to_be(
+    short_log: Path, tmp_path: Path
+) -> None:
+    solved = "estimator.momentum_gd.dimensions=3"
+    flat = [solved, *(f"anchors.{i}={place}" for i, place in enumerate(FLAT))]
+    for sets, is_shown in (([solved], True), (flat, False)):
+        result = run(short_log, ["momentum_gd", "ekf"], sets)
+        folder = tmp_path / str(is_shown)
+        write_outputs(result, folder)
+        said = json.loads((folder / "summary.json").read_text())["estimators"]
+        count, without = len(result.poses["momentum_gd"]), said["momentum_gd"]["poses_without_height"]
+        told = f"momentum_gd: height unobservable in {without} of {count} poses; the site's is kept"
+        assert told in sensor_lines(result)
+        # Of a single frame with three ranges in the room, of all where the anchors lie in one plane.
+        assert 0 < without < count / 4 if is_shown else without == count
+        # Who is told the height by the site does not pretend to look for it.
+        assert said["ekf"]["poses_without_height"] == 0
+        heights = np.loadtxt(folder / "poses.tum")[:, 3]
+        kept = int(np.isclose(heights, result.config.body.height, rtol=0.0, atol=1e-8).sum())
+        assert kept == without
 
 
 def test_poses_come_at_the_rate_asked_for(short_log: Path) -> None:

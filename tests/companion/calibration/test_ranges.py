@@ -117,3 +117,5 @@ def test_a_frame_keeps_what_no_bias_is_known_of_and_bad_ranges_stay_bad() -> Non
     np.testing.assert_array_equal(corrected.ranges, [4.5, 6.0, np.nan, np.nan])
     np.testing.assert_array_equal(frame.ranges, [5.0, 6.0, np.nan, 0.1])
     assert without_bias(frame, {}) is frame
+    of_tag = without_bias(frame, {1: RangeBias(0.5, 0.0, 0.0)}, {frame.tag_id: 0.25, frame.tag_id + 1: 9.0})
+    np.testing.assert_array_equal(of_tag.ranges, [4.25, 6.0, np.nan, np.nan])

@@ -18,7 +18,7 @@ from tests.strategies import range_frame
 
 DATA = Path(__file__).parents[2] / "data" / "lias_planar"
 TAG_0_IN_TROLLEY = np.array([[-0.0689, -0.1423]])
-YAW_OFFSET, CLOCK_OFFSET = np.deg2rad(7.0), 0.010
+YAW_OFFSET, CLOCK_OFFSET = np.deg2rad(7.0), 0.005
 """Heading of the tracked body [rad]; UWB clock ahead of the motion capture's [s]."""
 CALIBRATED, END = 30.0, 59.0
 

@@ -20,7 +20,7 @@ BIAS_SIGMA = 0.05
 
 def placed_by(robot: Robot, seconds: float) -> tuple[PlacedRanges, FloatArray]:
     """Ranges of a walk, and where the newest keyframe really was."""
-    window = Window(5.0, HorizontalRanges(0.1, ROOM), ROOM.tag_in_body)
+    window = Window(5.0, HorizontalRanges(0.1, ROOM), ROOM)
     keyframe = robot.pose
     for _ in range(round(seconds * 10)):
         for measurement in robot.walk(0.1):

@@ -17,7 +17,7 @@ SMALL = np.diag([1e-6, 1e-6, 1e-6])
 
 
 def window(length: float = 5.0) -> Window:
-    return Window(length, HorizontalRanges(0.1, ROOM), ROOM.tag_in_body)
+    return Window(length, HorizontalRanges(0.1, ROOM), ROOM)
 
 
 def step(from_tenths: int, to_tenths: int, x: float, is_keyframe: bool) -> PoseIncrement:

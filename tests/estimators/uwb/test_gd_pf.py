@@ -78,3 +78,19 @@ def test_positions_of_ranges_that_disagree_leave_the_particles_less_sure() -> No
         claims.append(float(np.sqrt(np.trace(pf.fix.cov[:2, :2]))))
     # Ten such frames leave the particles less sure than ten that agree.
     assert claims[1] > 1.5 * claims[0]
+
+
+def test_disagreement_stays_with_the_particles_when_a_frame_agrees_by_chance() -> None:
+    pf, *_ = walk(2, steps=30)
+    tag = np.array([4.0, 3.0, 0.6])
+    blocked = np.array(slants(NO_ARM, tag)) + np.array([0.8, 0.0, 0.0, 0.0])
+    common = []
+    for k in range(30, 80):
+        measured = blocked if k < 40 else np.array(slants(NO_ARM, tag))
+        pf.update(range_frame(k * SECOND_NS // 10, [1, 2, 3, 4], measured.tolist()))
+        assert pf.fix is not None
+        common.append(pf.fix.common_sigma)
+    # It grows by the filter's gain, is still there a tenth of a second later, and gone after some seconds.
+    assert 0.0 < common[0] < common[9]
+    assert common[10] > 0.9 * common[9]
+    assert common[-1] < 0.2 * common[9]

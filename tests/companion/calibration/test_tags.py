@@ -1,0 +1,121 @@
+"""Three tags of a real trolley by configuration and commands: imported, calibrated, position and heading."""
+
+import json
+import shutil
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from companion.calibrate_cli import app
+from companion.calibration.recording import read_recording
+from companion.calibration.tags import fit_tags
+from companion.config import load_config, params_dir
+from companion.errors import UserError
+from companion.importers.sources import import_log
+from companion.log import Log, RawChunk
+from companion.log_trial import run_records
+from companion.smooth import SMOOTHED, smooth_log
+from estimators.messages import RangeFrame
+from tests.strategies import range_frame
+
+DATA = Path(__file__).parents[2] / "data" / "lias_planar"
+SITE = params_dir() / "sites" / "lias_planar_tags.toml"
+CALIBRATED = 30.0
+ANCHORS = {1: np.array([0.0, 0.0, 2.0]), 2: np.array([6.0, 0.0, 2.0]), 3: np.array([0.0, 5.0, 2.0])}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The minute of the data set that we have, under the names of its authors."""
+    folder = tmp_path_factory.mktemp("lias")
+    _, *rows = (DATA / "uwb_three_tags.csv").read_text().splitlines()
+    (folder / "UWB_dynamic_exp_fast.csv").write_text("\n".join(rows[:295]) + "\n")
+    shutil.copy(DATA / "motion_capture.csv", folder / "motion_capture_dynamic_exp_fast.csv")
+    return folder
+
+
+def test_a_user_gets_position_and_heading_of_three_tags_by_commands(folder: Path) -> None:
+    log, site, found = folder / "lias.mcap", folder / "site.toml", folder / "found.json"
+    assert import_log(folder, log, SITE) == 3 * 295
+    shutil.copy(SITE, site)
+    call = ["ranges", str(log), "--site", str(site), "--against", "truth", "--until", str(CALIBRATED)]
+    done = CliRunner().invoke(app, [*call, "--picture", str(folder / "a.png"), "--json", str(found)])
+    assert done.exit_code == 0, done.output
+    assert "tag 0 beyond that" in done.output
+    tags = json.loads(found.read_text())["tags"]
+    assert sum(tag["bias_m"] for tag in tags.values()) == pytest.approx(0.0, abs=1e-9)
+    config = load_config(site)
+    assert config.tag_biases() == pytest.approx({int(i): tag["bias_m"] for i, tag in tags.items()}, abs=1e-4)
+    start_ns = Log(log).start_ns
+    known_ns = start_ns + round(CALIBRATED * 1e9)
+    records = [r for r in Log(log) if isinstance(r, RawChunk) or r.stamp_ns > known_ns]
+    before, after = (
+        run_records(records, str(log), each, start_ns, ["ekf"])["ekf"] for each in (load_config(SITE), config)
+    )
+    assert before is not None
+    assert after is not None
+    assert after.rmse_m < 0.06 < before.rmse_m
+    assert after.max_m < 0.25
+    assert after.yaw_rmse_deg is not None
+    assert after.yaw_rmse_deg < 8.0
+
+
+def test_a_smoothed_log_has_the_heading_of_three_tags_too(folder: Path) -> None:
+    import_log(folder, folder / "smooth.mcap", SITE)
+    found = smooth_log(Log(folder / "smooth.mcap"), load_config(SITE), find_anchors=False, find_biases=True)
+    accuracy = found.replay.accuracy(SMOOTHED)
+    assert accuracy is not None
+    assert accuracy.rmse < 0.06
+    assert accuracy.yaw_rmse_deg is not None
+    assert accuracy.yaw_rmse_deg < 8.0
+
+
+def test_one_tag_alone_comes_without_a_heading(folder: Path) -> None:
+    import_log(folder, folder / "one.mcap")
+    config = load_config(params_dir() / "sites" / "lias_planar.toml")
+    recording = read_recording(Log(folder / "one.mcap"), config, 5.0, with_odometry=False)
+    assert {frame.tag_id for frame in recording.range_frames} == {0}
+    assert np.isnan(recording.truths[0].pose[2])
+
+
+def test_what_knows_one_tag_alone_leaves_the_others_out(folder: Path) -> None:
+    import_log(folder, folder / "all.mcap", SITE)
+    log, config = Log(folder / "all.mcap"), load_config(SITE)
+    for every_tag, expected in ((True, {0, 1, 2}), (False, {0})):
+        recording = read_recording(log, config, 5.0, with_odometry=False, every_tag=every_tag)
+        assert {frame.tag_id for frame in recording.range_frames} == expected
+
+
+def drive(biases: dict[int, float], seed: int) -> Iterator[tuple[RangeFrame, list[float]]]:
+    """Ranges of tags that move through a room, and where each was."""
+    rng = np.random.default_rng(seed)
+    of_anchor = {1: 0.10, 2: 0.25, 3: -0.05}
+    for k in range(200):
+        for tag_id, bias in biases.items():
+            tag = [2.0 + np.sin(0.03 * k + tag_id), 2.0 + np.cos(0.05 * k), 0.4]
+            slants = [float(np.linalg.norm(a - tag)) + of_anchor[i] for i, a in ANCHORS.items()]
+            noisy = (np.array(slants) + bias + 0.05 * rng.standard_normal(3)).tolist()
+            yield replace(range_frame(k * 10**8, list(ANCHORS), noisy), tag_id=tag_id), tag
+
+
+def test_what_a_tag_adds_to_every_anchor_is_found_as_well_as_claimed() -> None:
+    true = {4: 0.06, 7: -0.04, 9: -0.02}
+    squares = []
+    for seed in range(20):
+        frames, tags = zip(*drive(true, seed), strict=True)
+        found = fit_tags(frames, np.array(tags), ANCHORS, 0)
+        assert list(found) == list(true)
+        squares += [((found[i].constant - bias) / found[i].sigma) ** 2 for i, bias in true.items()]
+    assert 0.5 < np.mean(squares) < 2.0
+
+
+def test_a_single_tag_has_no_part_of_its_own_and_tags_that_share_no_anchor_are_told() -> None:
+    frames, tags = zip(*drive({4: 0.06}, 1), strict=True)
+    assert fit_tags(frames, np.array(tags), ANCHORS, 0) == {}
+    apart = [replace(f, tag_id=k % 2, anchor_ids=f.anchor_ids + 10 * (k % 2)) for k, f in enumerate(frames)]
+    with pytest.raises(UserError, match="no anchor has enough ranges of all 2 tags"):
+        fit_tags(apart, np.array(tags), ANCHORS | {i + 10: a for i, a in ANCHORS.items()}, 0)
