@@ -129,7 +129,7 @@ def test_what_other_tools_made_of_it_reads_the_same(tmp_path: Path) -> None:
         channel = writer.register_channel("/raw/uwb/in", "application/octet-stream", 0)
         for record in records:
             writer.add_message(channel, record.stamp_ns, record.data, record.stamp_ns)
-        writer.finish()
+        writer.finish()  # type: ignore[no-untyped-call]
     log = Log(tmp_path / "chunked.mcap")
     assert list(log) == records
     assert (log.config_toml, log.start_ns, log.complete) == (plain.config_toml, 42, True)

@@ -126,7 +126,7 @@ def test_sums_are_those_of_weighted_least_squares(seed: int) -> None:
         (weights * r * r).sum(),
     )
     for got, wanted in zip(found, expected, strict=True):
-        assert_allclose(got, wanted, rtol=1e-12, atol=1e-12)
+        assert_allclose(np.asarray(got, dtype=np.float64), wanted, rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize("seed", SEEDS)
