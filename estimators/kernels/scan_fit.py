@@ -196,14 +196,14 @@ def settle(
     """Minimise the distances of surface points from their lines and the deviation from the prediction.
 
     Args:
-        points: as all up to `columns` for `associate`, but for the next.
-        normals: see there.
-        basis: see there.
-        lines: see there.
+        points: (N, 2) [m] as for `associate`.
+        normals: (N, 2) as for `associate`.
+        basis: (N, 4) as for `associate`.
+        lines: (M, 6) as for `associate`.
         spans: (M, 2) first and last point of each line.
-        begin: see there.
-        grid: see there.
-        columns: see there.
+        begin: as for `associate`.
+        grid: (4,) as for `associate`.
+        columns: as for `associate`.
         count: number of points that the lines go through.
         prior: (12, 12) information on the states beforehand.
         predicted: (12,) states beforehand.

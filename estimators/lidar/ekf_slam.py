@@ -74,6 +74,9 @@ class EkfSlam:
             T_body_lidar: (3,) mounting of the lidar in the body: x [m], y [m], yaw [rad].
             preparation: what is done with the points beforehand; by default what its Config says.
         """
+        # Numba loads slowly: here, and not at the first scan.
+        import estimators.kernels.scan_fit  # noqa: F401
+
         self._config = config
         self._T_body_lidar = T_body_lidar
         self._preparation = ScanPreparation(preparation or ScanPreparation.Config(), T_body_lidar)
