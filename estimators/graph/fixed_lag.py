@@ -5,10 +5,17 @@ of time, behind the variables that do not move. Those older than the lag are mar
 are linearised for good and become a quadratic on the nodes that they share factors with. Time and memory of
 an update are bounded by the nodes within the lag.
 
-Source: Dong-Si and Mourikis, ICRA 2011, fixed-lag smoothing by marginalisation.
+Most updates do not solve for all of the window. What it said of its newest state, and of the pose that
+increments refer to, when it was last solved as a whole is a quadratic, too; nodes that came since are solved
+with that. All is solved and linearised anew after `_MOST_NEW` nodes, and at once when that quadratic is no
+longer good: what it is on moved by more than the search tolerates, or a factor goes further back.
+
+Source: Dong-Si and Mourikis, ICRA 2011, fixed-lag smoothing by marginalisation; linearising anew only what
+moved: Kaess et al., iSAM2, International Journal of Robotics Research 31(2), 2012.
 """
 
 from collections.abc import Collection
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -17,19 +24,36 @@ from estimators.graph.errors import GraphError
 from estimators.graph.factors import DensePrior, Graph
 from estimators.graph.solver import arrays
 from estimators.kernels import optimise, window
-from estimators.kernels.factors import last_use, system_of
+from estimators.kernels.factors import system_of
 from estimators.kernels.window import BoolArray
 from estimators.messages import FloatArray, IntArray
 
 _TABLES = {"increments": 2, "ranges": 2, "sightings": 2, "motions": 4, "priors": 1}
 """Leading columns of each table that are variables."""
+_MOST_NEW = 10
+"""Nodes that are solved for without the others: with more, a solution of all costs little in comparison."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Settled:
+    """A window when all of it was solved.
+
+    Attributes:
+        nodes: how many it had.
+        rows: how many factors, by the name of their table.
+        said: what all of them said of its newest state, and of a reference.
+    """
+
+    nodes: int
+    rows: dict[str, int]
+    said: DensePrior
 
 
 class FixedLag:
     """Sliding window of nodes.
 
     Attributes:
-        graph: of the window; values are those of the last `update`.
+        graph: of the window; values are those of the last `update`, older ones of one before.
         stamps_ns: (N,) instants of the nodes.
 
     Args:
@@ -46,6 +70,7 @@ class FixedLag:
         self._tolerance = tolerance
         self.graph = Graph(known.copy(), np.zeros_like(known))
         self.stamps_ns = np.empty(0, dtype=np.int64)
+        self._settled: _Settled | None = None
 
     def variable(self, node: int) -> int:
         """Number of a node's pose; its velocity has the next."""
@@ -93,6 +118,7 @@ class FixedLag:
         node = int(np.searchsorted(self.stamps_ns, stamp_ns))
         graph, at = self.graph, self.variable(node)
         if node < len(self.stamps_ns):
+            self._settled = None
             self._renumber(np.arange(len(graph.values)) + self._width * (np.arange(len(graph.values)) >= at))
             graph.values = np.insert(graph.values, at, state, axis=0)
             self.stamps_ns = np.insert(self.stamps_ns, node, stamp_ns)
@@ -128,7 +154,7 @@ class FixedLag:
             setattr(self.graph, name, np.concatenate([getattr(self.graph, name), rows]))
 
     def drop_before(self, horizon_ns: int, kept_ns: Collection[int] = ()) -> None:
-        """Marginalise what is older than the horizon.
+        """Marginalise what is older than the horizon, once the last update was one of the whole window.
 
         Nodes at which increments to younger nodes begin stay, and so does the newest.
 
@@ -136,7 +162,7 @@ class FixedLag:
             horizon_ns: older nodes go.
             kept_ns: instants of nodes that stay all the same.
         """
-        if len(self.stamps_ns) < 2 or self.stamps_ns[0] >= horizon_ns:
+        if len(self.stamps_ns) < 2 or self.stamps_ns[0] >= horizon_ns or self._has_new():
             return
         leaving = window.leaving(self.stamps_ns, horizon_ns, self.graph.increments, self._known, self._width)
         leaving[-1] = False
@@ -165,8 +191,15 @@ class FixedLag:
         asked = [self.variable(len(self.stamps_ns) - 1) + i for i in range(self._width)]
         if reference is not None:
             asked.append(self.variable(reference))
-        values, covariance = self._optimum(asked, self._iterations)
-        self.graph.values = values
+        variables = np.array(asked)
+        covariance = self._solve_newest(variables)
+        if covariance is None:
+            self.graph.values, covariance, information = self._solve_all(variables, self._iterations)
+            said = DensePrior(
+                variables, self.graph.values[variables], information, np.zeros(len(information))
+            )
+            rows = {name: len(getattr(self.graph, name)) for name in _TABLES}
+            self._settled = _Settled(len(self.stamps_ns), rows, said)
         return covariance
 
     def state_of(self, node: int) -> tuple[FloatArray, FloatArray]:
@@ -175,32 +208,59 @@ class FixedLag:
         Raises:
             GraphError: as `update`.
         """
-        asked = [self.variable(node) + i for i in range(self._width)]
-        return self.graph.values[asked].ravel(), self._optimum(asked, 1)[1]
+        variables = self.variable(node) + np.arange(self._width)
+        values, covariance, _ = self._solve_all(variables, 1)
+        return values[variables].ravel(), covariance
 
-    def _optimum(self, asked: list[int], iterations: int) -> tuple[FloatArray, FloatArray]:
-        """Values (V, 3) at the optimum, and the covariance of the variables asked for."""
-        graph = self.graph
-        taken = arrays(graph)
-        count = len(graph.values)
-        last_needed = last_use(taken)
-        # What is asked for goes last: its covariance is then read off the end of the factor.
-        last_needed[asked] = count + np.arange(len(asked))
-        order = np.full(count, -1, dtype=np.int64)
-        sequence = self._known + np.argsort(last_needed[self._known :], kind="stable")
-        order[sequence] = np.arange(len(sequence))
-        system = system_of(taken, order, len(sequence))
-        values = graph.values.copy()
-        status, _, _, diagonal, below = optimise.gauss_newton(
-            values, taken, system, iterations, self._tolerance
+    def _has_new(self) -> bool:
+        """Whether anything came since all was solved."""
+        settled = self._settled
+        return settled is not None and (
+            len(self.stamps_ns) > settled.nodes
+            or any(len(getattr(self.graph, name)) > count for name, count in settled.rows.items())
         )
-        if status not in (optimise.CONVERGED, optimise.NOT_CONVERGED) or not np.isfinite(values).all():
+
+    def _solve_newest(self, asked: IntArray) -> FloatArray | None:
+        """Solve for the nodes that came since all was solved; covariance of the variables asked for.
+
+        None, and all is as it was, where that would not be the optimum of the window.
+        """
+        settled, graph = self._settled, self.graph
+        if settled is None or not self._has_new() or len(self.stamps_ns) - settled.nodes > _MOST_NEW:
+            return None
+        said, values = settled.said, graph.values.copy()
+        newer = Graph(values, graph.free, dense=said)
+        for name, count in settled.rows.items():
+            setattr(newer, name, getattr(graph, name)[count:])
+        status, covariance, _ = optimise.solve_window(
+            values,
+            arrays(newer),
+            asked,
+            self._known,
+            self.variable(settled.nodes),
+            self._iterations,
+            self._tolerance,
+        )
+        poses = (said.variables - self._known) % self._width == 0
+        moved = np.abs(values[said.variables] - said.at)[poses]
+        if status not in (optimise.CONVERGED, optimise.NOT_CONVERGED) or moved.max() > self._tolerance:
+            return None
+        graph.values = values
+        return covariance
+
+    def _solve_all(self, asked: IntArray, iterations: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Values (V, 3) at the optimum; covariance of the variables asked for, and its inverse."""
+        values = self.graph.values.copy()
+        status, covariance, information = optimise.solve_window(
+            values, arrays(self.graph), asked, self._known, self._known, iterations, self._tolerance
+        )
+        if status not in (optimise.CONVERGED, optimise.NOT_CONVERGED):
             raise GraphError("window: something in it is not determined, or not finite")
-        covariance = optimise.last_covariance(system[1], system[2], diagonal, below, len(asked))
-        return values, covariance
+        return values, covariance, information
 
     def _marginalise(self, leaving: BoolArray, everything: bool = False) -> None:
         """Linearise the factors on nodes that leave, or all factors, and keep what they say of the rest."""
+        settled, self._settled = self._settled, None
         graph, count = self.graph, len(self.graph.values)
         gone = np.zeros(count, dtype=np.bool_)
         gone[self._known :] = np.repeat(leaving, self._width)
@@ -225,6 +285,10 @@ class FixedLag:
         graph.dense = DensePrior(numbers[staying], graph.values[staying], information, gradient)
         graph.values, graph.free = graph.values[~gone], graph.free[~gone]
         self.stamps_ns = self.stamps_ns[~leaving]
+        if settled is not None and not everything and not gone[settled.said.variables].any():
+            said = replace(settled.said, variables=numbers[settled.said.variables])
+            rows = {name: len(getattr(graph, name)) for name in _TABLES}
+            self._settled = _Settled(len(self.stamps_ns), rows, said)
 
     def _renumber(self, numbers: IntArray) -> None:
         """Give every variable a new number (V,), in tables and prior."""
