@@ -24,7 +24,6 @@ from estimators.messages import (
     PoseIncrement,
     RangeFrame,
 )
-from estimators.models.motion import constant_velocity
 from estimators.range_gate import Candidate, RangeGate
 
 POSE, VELOCITY, KEYFRAME = slice(0, 3), slice(3, 6), slice(6, 9)
@@ -90,6 +89,12 @@ class ParticleCloud(FixTaker):
         return Sketch(particles=self._particles[:, POSE].copy())
 
     @property
+    def mean(self) -> FloatArray:
+        """Mean pose (3,) at the newest measurement: x [m], y [m], yaw [rad], map frame."""
+        mean, _ = self._cloud.moments(self._particles, self._weights, 3)
+        return mean
+
+    @property
     def gate(self) -> RangeGate:
         """What judges ranges, for those who take up where the cloud leaves off."""
         return self._gate
@@ -100,10 +105,9 @@ class ParticleCloud(FixTaker):
             return None
         mean, cov = self._cloud.moments(self._particles, self._weights, 6)
         dt = 0.0 if self._stands else (stamp_ns - self._stamp_ns) * 1e-9
-        F, Q = constant_velocity(dt, *self._accel_noise)
-        cov = F @ cov @ F.T + Q
-        cov = 0.5 * (cov + cov.T) + self._cloud.LEAST_VARIANCE * np.eye(6)
-        return self._estimate(stamp_ns, F @ mean, cov)
+        mean, cov = self._motion.predicted(mean, cov, dt, *self._accel_noise)
+        cov.flat[::7] += self._cloud.LEAST_VARIANCE
+        return self._estimate(stamp_ns, mean, cov)
 
     @abstractmethod
     def _take(self, misfits: FloatArray, measured: Likelihood) -> None:

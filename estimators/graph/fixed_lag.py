@@ -153,7 +153,7 @@ class FixedLag:
         for name, rows in tables.items():
             setattr(self.graph, name, np.concatenate([getattr(self.graph, name), rows]))
 
-    def drop_before(self, horizon_ns: int, kept_ns: Collection[int] = ()) -> None:
+    def drop_before(self, horizon_ns: int, kept_ns: Collection[int] = ()) -> bool:
         """Marginalise what is older than the horizon, once the last update was one of the whole window.
 
         Nodes at which increments to younger nodes begin stay, and so does the newest.
@@ -161,16 +161,21 @@ class FixedLag:
         Args:
             horizon_ns: older nodes go.
             kept_ns: instants of nodes that stay all the same.
+
+        Returns:
+            Whether any node has left.
         """
         if len(self.stamps_ns) < 2 or self.stamps_ns[0] >= horizon_ns or self._has_new():
-            return
+            return False
         leaving = window.leaving(self.stamps_ns, horizon_ns, self.graph.increments, self._known, self._width)
         leaving[-1] = False
         for stamp_ns in kept_ns:
             if (node := self.node_at(stamp_ns)) is not None:
                 leaving[node] = False
-        if leaving.any():
-            self._marginalise(leaving)
+        if not leaving.any():
+            return False
+        self._marginalise(leaving)
+        return True
 
     def absorb(self) -> None:
         """Make all that is known of the nodes a quadratic: their factors will not be linearised again."""

@@ -56,8 +56,7 @@ class PfIbasGraph(GraphSmoother):
         return self._taken(frame.stamp_ns, "ranges", rows, self._said)
 
     def _guess(self, stamp_ns: int) -> FloatArray:
-        state, pose = super()._guess(stamp_ns), self._filter.pose_at(stamp_ns)
-        if pose is not None:
-            turn = wrap_angle(pose.yaw - float(state[0, 2]))
-            state[0] = *pose.xy, state[0, 2] + turn
+        state, pose = super()._guess(stamp_ns), self._filter.mean  # of this instant: it has taken what is there
+        turn = wrap_angle(float(pose[2] - state[0, 2]))
+        state[0] = pose[0], pose[1], state[0, 2] + turn
         return state
