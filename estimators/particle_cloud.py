@@ -159,28 +159,32 @@ class ParticleCloud(FixTaker):
         count = len(frame.ranges)
         verdicts = [Verdict.ACCEPTED] * count
         innovations, nis = np.full(count, np.nan), np.full(count, np.nan)
-        candidates: dict[int, Candidate] = {}
-        pose, _ = self._cloud.moments(self._particles, self._weights, 3)
-        for i, item in enumerate(self._gate.candidates(frame, pose)):
+        candidates: list[tuple[int, Candidate]] = []
+        for i, item in enumerate(self._gate.candidates(frame, self.mean)):
             if isinstance(item, Verdict):
                 verdicts[i] = item
             else:
-                candidates[i] = item
+                candidates.append((i, item))
         if not candidates:
             return Report(tuple(verdicts), innovations, nis)
-        ranges = np.array([(c.anchor[0], c.anchor[1], c.measured, c.sigma) for c in candidates.values()])
-        mean, cov = self._likelihood.expected_residuals(self._particles, self._weights, self._arm, ranges)
-        for k, (i, candidate) in enumerate(candidates.items()):
+        ranges = np.array([(c.anchor[0], c.anchor[1], c.measured, c.sigma) for _, c in candidates])
+        expected = self._likelihood.expected_residuals(self._particles, self._weights, self._arm, ranges)
+        # In plain floats: arrays of a few numbers take longer than all of the arithmetic.
+        mean, cov = expected[0].tolist(), expected[1].tolist()
+        for k, (i, candidate) in enumerate(candidates):
+            known = cov[k]
             innovations[i] = mean[k]
-            nis[i] = mean[k] ** 2 / (cov[k, k] + candidate.sigma**2)
-            verdicts[i], factor = self._gate.judge(candidate, innovations[i], nis[i])
+            nis[i] = square = mean[k] ** 2 / (known[k] + candidate.sigma**2)
+            verdicts[i], factor = self._gate.judge(candidate, mean[k], square)
             if not verdicts[i].is_used:
                 ranges[k, 3] = np.inf
                 continue
             # What is used corrects the expectation of those after it, as in a Kalman filter.
-            ranges[k, 3] *= factor
-            gain = cov[:, k] / (cov[k, k] + ranges[k, 3] ** 2)
-            mean, cov = mean - gain * mean[k], cov - np.outer(gain, cov[k])
+            ranges[k, 3] = sigma = factor * candidate.sigma
+            for j in range(k + 1, len(candidates)):
+                gain = cov[j][k] / (known[k] + sigma**2)
+                mean[j] -= gain * mean[k]
+                cov[j] = [value - gain * other for value, other in zip(cov[j], known, strict=True)]
         if any(verdict.is_used for verdict in verdicts):
             fixes = Fixes(self._likelihood.misfits, self._arm, ranges, _NO_LANDMARKS)
             self._take(fixes(self._particles), fixes)

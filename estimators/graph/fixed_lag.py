@@ -42,11 +42,13 @@ class _Settled:
         nodes: how many it had.
         rows: how many factors, by the name of their table.
         said: what all of them said of its newest state, and of a reference.
+        poses: (K,) which of those variables are poses: motion is linear in velocities.
     """
 
     nodes: int
     rows: dict[str, int]
     said: DensePrior
+    poses: BoolArray
 
 
 class FixedLag:
@@ -66,6 +68,7 @@ class FixedLag:
     def __init__(self, known: FloatArray, width: int, iterations: int = 4, tolerance: float = 1e-2) -> None:
         self._known = len(known)
         self._width = width
+        self._all_free = np.ones((width, 3))
         self._iterations = iterations
         self._tolerance = tolerance
         self.graph = Graph(known.copy(), np.zeros_like(known))
@@ -78,7 +81,7 @@ class FixedLag:
 
     def node_at(self, stamp_ns: int) -> int | None:
         """The node of an instant, if the window has it."""
-        node = int(np.searchsorted(self.stamps_ns, stamp_ns))
+        node = int(self.stamps_ns.searchsorted(stamp_ns))
         return node if node < len(self.stamps_ns) and self.stamps_ns[node] == stamp_ns else None
 
     def nearest(self, stamp_ns: int) -> int:
@@ -115,7 +118,7 @@ class FixedLag:
         Returns:
             Its number; numbers of later nodes grow by one.
         """
-        node = int(np.searchsorted(self.stamps_ns, stamp_ns))
+        node = int(self.stamps_ns.searchsorted(stamp_ns))
         graph, at = self.graph, self.variable(node)
         if node < len(self.stamps_ns):
             self._settled = None
@@ -124,8 +127,8 @@ class FixedLag:
             self.stamps_ns = np.insert(self.stamps_ns, node, stamp_ns)
         else:
             graph.values = np.concatenate([graph.values, state])
-            self.stamps_ns = np.append(self.stamps_ns, stamp_ns)
-        graph.free = np.concatenate([graph.free, np.full((self._width, 3), 1.0)])
+            self.stamps_ns = np.concatenate([self.stamps_ns, [stamp_ns]])
+        graph.free = np.concatenate([graph.free, self._all_free])
         return node
 
     def interpolate(self, stamp_ns: int) -> int | None:
@@ -200,12 +203,15 @@ class FixedLag:
         covariance = self._solve_newest(variables)
         if covariance is None:
             self.graph.values, covariance, information = self._solve_all(variables, self._iterations)
-            said = DensePrior(
-                variables, self.graph.values[variables], information, np.zeros(len(information))
-            )
-            rows = {name: len(getattr(self.graph, name)) for name in _TABLES}
-            self._settled = _Settled(len(self.stamps_ns), rows, said)
+            at = self.graph.values[variables]
+            self._settle(DensePrior(variables, at, information, np.zeros(len(information))))
         return covariance
+
+    def _settle(self, said: DensePrior) -> None:
+        """Note what the window says now that all of it was solved."""
+        rows = {name: len(getattr(self.graph, name)) for name in _TABLES}
+        poses = (said.variables - self._known) % self._width == 0
+        self._settled = _Settled(len(self.stamps_ns), rows, said, poses)
 
     def state_of(self, node: int) -> tuple[FloatArray, FloatArray]:
         """State (3 width,) of any node and its covariance, given all that is in the window.
@@ -233,22 +239,27 @@ class FixedLag:
         settled, graph = self._settled, self.graph
         if settled is None or not self._has_new() or len(self.stamps_ns) - settled.nodes > _MOST_NEW:
             return None
-        said, values = settled.said, graph.values.copy()
-        newer = Graph(values, graph.free, dense=said)
-        for name, count in settled.rows.items():
-            setattr(newer, name, getattr(graph, name)[count:])
-        status, covariance, _ = optimise.solve_window(
-            values,
-            arrays(newer),
-            asked,
-            self._known,
-            self.variable(settled.nodes),
-            self._iterations,
-            self._tolerance,
+        said, values, rows = settled.said, graph.values.copy(), settled.rows
+        newer = (
+            graph.free,
+            graph.increments[rows["increments"] :],
+            graph.ranges[rows["ranges"] :],
+            graph.sightings[rows["sightings"] :],
+            graph.motions[rows["motions"] :],
+            graph.priors[rows["priors"] :],
+            said.variables,
+            said.at,
+            said.information,
+            said.gradient,
         )
-        poses = (said.variables - self._known) % self._width == 0
-        moved = np.abs(values[said.variables] - said.at)[poses]
-        if status not in (optimise.CONVERGED, optimise.NOT_CONVERGED) or moved.max() > self._tolerance:
+        first = self.variable(settled.nodes)
+        status, covariance, _ = optimise.solve_window(
+            values, newer, asked, self._known, first, self._iterations, self._tolerance
+        )
+        if status not in (optimise.CONVERGED, optimise.NOT_CONVERGED):
+            return None
+        moved = np.abs(values[said.variables] - said.at)[settled.poses]
+        if moved.max() > self._tolerance:
             return None
         graph.values = values
         return covariance
@@ -291,9 +302,7 @@ class FixedLag:
         graph.values, graph.free = graph.values[~gone], graph.free[~gone]
         self.stamps_ns = self.stamps_ns[~leaving]
         if settled is not None and not everything and not gone[settled.said.variables].any():
-            said = replace(settled.said, variables=numbers[settled.said.variables])
-            rows = {name: len(getattr(graph, name)) for name in _TABLES}
-            self._settled = _Settled(len(self.stamps_ns), rows, said)
+            self._settle(replace(settled.said, variables=numbers[settled.said.variables]))
 
     def _renumber(self, numbers: IntArray) -> None:
         """Give every variable a new number (V,), in tables and prior."""

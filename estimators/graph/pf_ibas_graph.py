@@ -7,7 +7,6 @@ from estimators.geometry import wrap_angle
 from estimators.graph.smoother import GraphSmoother
 from estimators.messages import FloatArray, LandmarkFrame, Measurement, RangeFrame
 from estimators.pf_ibas import PfIbas
-from estimators.range_gate import HorizontalRanges
 
 
 class PfIbasGraph(GraphSmoother):
@@ -24,7 +23,6 @@ class PfIbasGraph(GraphSmoother):
 
     def __init__(self, config: Config, setup: Setup) -> None:
         self._filter = PfIbas(config, setup)
-        self._horizontal = HorizontalRanges(config.range_sigma, setup)
         super().__init__(config, setup)
         self._gate = self._filter.gate
 
@@ -51,12 +49,15 @@ class PfIbasGraph(GraphSmoother):
         if not isinstance(frame, RangeFrame) or Verdict.LATE in self._said.verdicts:
             return super()._judge(frame, mean, cov)
         rows = self._judging.believed_ranges(
-            self._horizontal, frame, self._said.verdicts, self._setup.tag_in_body, self._anchor_numbers
+            self._gate.horizontal, frame, self._said.verdicts, self._setup.tag_in_body, self._anchor_numbers
         )
         return self._taken(frame.stamp_ns, "ranges", rows, self._said)
 
     def _guess(self, stamp_ns: int) -> FloatArray:
-        state, pose = super()._guess(stamp_ns), self._filter.mean  # of this instant: it has taken what is there
+        state, pose = (
+            super()._guess(stamp_ns),
+            self._filter.mean,
+        )  # of this instant: it has taken what is there
         turn = wrap_angle(float(pose[2] - state[0, 2]))
         state[0] = pose[0], pose[1], state[0, 2] + turn
         return state

@@ -170,9 +170,7 @@ def _last_root(
     return root
 
 
-@compiled(
-    f"Tuple((int64, {MATRIX}, {MATRIX}))({MATRIX}, {GRAPH}, {INDICES}, int64, int64, int64, float64)"
-)
+@compiled(f"Tuple((int64, {MATRIX}, {MATRIX}))({MATRIX}, {GRAPH}, {INDICES}, int64, int64, int64, float64)")
 def solve_window(
     values: FloatArray,
     graph: GraphArrays,
