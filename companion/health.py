@@ -153,16 +153,16 @@ class HealthMonitor:
 
     def observe(self, measurement: Measurement, report: Report) -> None:
         """Take note of what the estimator made of a measurement."""
-        stamp_ns = measurement_stamp_ns(measurement)
         if self._begin_ns is None:
-            self._begin_ns = stamp_ns
-        self._note = report.note
-        good = sum(verdict is Verdict.ACCEPTED for verdict in report.verdicts)
-        if isinstance(measurement, PoseIncrement):
-            if good and measurement.from_stamp_ns < measurement.stamp_ns:
-                self._increment_ns = stamp_ns
+            self._begin_ns = measurement_stamp_ns(measurement)
+        if not isinstance(measurement, RangeFrame | PoseIncrement):
             return
-        if not isinstance(measurement, RangeFrame):
+        self._note = report.note
+        stamp_ns = measurement.stamp_ns
+        good = report.verdicts.count(Verdict.ACCEPTED)
+        if isinstance(measurement, PoseIncrement):
+            if good and measurement.from_stamp_ns < stamp_ns:
+                self._increment_ns = stamp_ns
             return
         self._observe_anchors(measurement, report)
         gated = [i for i, verdict in enumerate(report.verdicts) if verdict is Verdict.GATED]

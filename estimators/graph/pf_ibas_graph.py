@@ -26,6 +26,11 @@ class PfIbasGraph(GraphSmoother):
         super().__init__(config, setup)
         self._gate = self._filter.gate
 
+    @property
+    def takes(self) -> frozenset[type[Measurement]]:
+        """What filter or graph takes."""
+        return super().takes | self._filter.takes
+
     def reset(self) -> None:
         """Stand at the start again, filter and graph."""
         self._filter.reset()

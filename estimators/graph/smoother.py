@@ -23,6 +23,7 @@ from estimators.messages import (
     PoseEstimate,
     PoseIncrement,
     RangeFrame,
+    Scan,
 )
 from estimators.models.motion import increment
 from estimators.range_gate import RangeGate
@@ -32,6 +33,10 @@ SAME_NS = 1_000_000
 POSE, VELOCITY, REFERENCE, STATE = slice(0, 3), slice(3, 6), slice(6, 9), slice(0, 6)
 _WIDEST = np.array([100.0, 100.0, np.pi, 10.0, 10.0, 10.0])
 """Standard deviations [m, rad, m/s, rad/s] beyond which a window that begins anew knows nothing at all."""
+
+_TAKES: frozenset[type[Measurement]] = frozenset(
+    {RangeFrame, LandmarkFrame, PoseIncrement, LoopClosure, Scan}
+)
 
 
 class GraphSmoother(KeyframeTracker):
@@ -73,6 +78,11 @@ class GraphSmoother(KeyframeTracker):
         places = [*(p[:2] for p in setup.anchors.values()), *setup.landmarks.values()]
         self._known = np.array([[*place, 0.0] for place in places]).reshape(-1, 3)
         self.reset()
+
+    @property
+    def takes(self) -> frozenset[type[Measurement]]:
+        """Scans are among them, for what they show of obstacles."""
+        return _TAKES
 
     @property
     def state(self) -> tuple[FloatArray, FloatArray]:
