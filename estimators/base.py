@@ -43,6 +43,8 @@ class Verdict(StrEnum):
     NOT_USED = "not used"
     """This estimator has no use for such a measurement."""
 
+    __hash__ = str.__hash__  # that of enumerations is slow, and unequal for equal strings
+
     @property
     def is_nlos(self) -> bool:
         """Whether a range was rejected because something probably blocks it."""

@@ -21,7 +21,7 @@ Reduced: TypeAlias = tuple[FloatArray, float, float]
 """Anchor (3,), horizontal range to it and the standard deviation of that [m]."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(slots=True, eq=False)  # not frozen: that costs four times as much to make, four times a frame
 class Candidate:
     """A range that is to be held against its prediction.
 
