@@ -8,7 +8,7 @@ an update are bounded by the nodes within the lag.
 Most updates do not solve for all of the window. What it said of its newest state, and of the pose that
 increments refer to, when it was last solved as a whole is a quadratic, too; nodes that came since are solved
 with that. All is solved and linearised anew after `_MOST_NEW` nodes, and at once when that quadratic is no
-longer good: what it is on moved by more than the search tolerates, or a factor goes further back.
+longer good: what it is on has moved too far, or a factor goes further back.
 
 Source: Dong-Si and Mourikis, ICRA 2011, fixed-lag smoothing by marginalisation; linearising anew only what
 moved: Kaess et al., iSAM2, International Journal of Robotics Research 31(2), 2012.
@@ -32,6 +32,9 @@ _TABLES = {"increments": 2, "ranges": 2, "sightings": 2, "motions": 4, "priors":
 """Leading columns of each table that are variables."""
 _MOST_NEW = 10
 """Nodes that are solved for without the others: with more, a solution of all costs little in comparison."""
+_FARTHEST = 3.0
+"""So many times what the search tolerates may that move which old nodes say something of, until they are
+linearised anew. By default that is 3 cm and 0.03 rad; iSAM2 as GTSAM ships it waits for 0.1 of either."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -259,7 +262,7 @@ class FixedLag:
         if status not in (optimise.CONVERGED, optimise.NOT_CONVERGED):
             return None
         moved = np.abs(values[said.variables] - said.at)[settled.poses]
-        if moved.max() > self._tolerance:
+        if moved.max() > _FARTHEST * self._tolerance:
             return None
         graph.values = values
         return covariance
