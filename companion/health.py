@@ -3,12 +3,20 @@
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from math import hypot, sqrt
 
 import numpy as np
 
 from companion.config import HealthTable
 from estimators.base import Report, Verdict
-from estimators.messages import Measurement, PoseEstimate, PoseIncrement, RangeFrame, measurement_stamp_ns
+from estimators.messages import (
+    FloatArray,
+    Measurement,
+    PoseEstimate,
+    PoseIncrement,
+    RangeFrame,
+    measurement_stamp_ns,
+)
 
 MEMORY = 2.0
 """Time constant [s] over which the shares of accepted and of too short ranges are remembered."""
@@ -153,16 +161,16 @@ class HealthMonitor:
 
     def observe(self, measurement: Measurement, report: Report) -> None:
         """Take note of what the estimator made of a measurement."""
-        stamp_ns = measurement_stamp_ns(measurement)
         if self._begin_ns is None:
-            self._begin_ns = stamp_ns
-        self._note = report.note
-        good = sum(verdict is Verdict.ACCEPTED for verdict in report.verdicts)
-        if isinstance(measurement, PoseIncrement):
-            if good and measurement.from_stamp_ns < measurement.stamp_ns:
-                self._increment_ns = stamp_ns
+            self._begin_ns = measurement_stamp_ns(measurement)
+        if not isinstance(measurement, RangeFrame | PoseIncrement):
             return
-        if not isinstance(measurement, RangeFrame):
+        self._note = report.note
+        stamp_ns = measurement.stamp_ns
+        good = report.verdicts.count(Verdict.ACCEPTED)
+        if isinstance(measurement, PoseIncrement):
+            if good and measurement.from_stamp_ns < stamp_ns:
+                self._increment_ns = stamp_ns
             return
         self._observe_anchors(measurement, report)
         gated = [i for i, verdict in enumerate(report.verdicts) if verdict is Verdict.GATED]
@@ -244,7 +252,7 @@ class HealthMonitor:
             return Health(State.LOST, "pose or covariance is not finite")
         if np.linalg.eigvalsh(cov)[0] <= 0.0:
             return Health(State.LOST, "covariance is not positive definite")
-        sigma_xy = float(np.sqrt(np.linalg.eigvalsh(pose.cov[:2, :2])[1]))
+        sigma_xy = _widest(pose.cov[:2, :2])
         if sigma_xy > table.max_sigma_xy:
             what = f"position sigma {sigma_xy:.2f} m"
             return Health(State.LOST, f"{what} above {table.max_sigma_xy:g} m", what)
@@ -305,3 +313,9 @@ class HealthMonitor:
         if self._has_scans:
             sources.append(source("LiDAR increment", self._increment_ns, table.max_increment_age))
         return sources
+
+
+def _widest(cov: FloatArray) -> float:
+    """Standard deviation along the longer axis of an ellipse, from its covariance (2, 2)."""
+    (xx, xy), (_, yy) = cov.tolist()
+    return sqrt(0.5 * (xx + yy) + hypot(0.5 * (xx - yy), xy))

@@ -21,7 +21,7 @@ from drivers import make_sensor
 from drivers.autopilot import Autopilot
 from drivers.framing import Sensor
 from estimators import make_estimator
-from estimators.base import Estimator, Report, Sketch, Sketched
+from estimators.base import Estimator, Report, Sketch, Sketched, Verdict, taken_by
 from estimators.lidar.front_ends import ScanFrontEnd, make_scan_front_end
 from estimators.lidar.fused_odometry import FusedOdometry
 from estimators.lidar.scan_matching import ScanMatcher
@@ -90,6 +90,10 @@ class Pipeline:
         self._front_end = front_end
         self._estimators = dict(estimators)
         self._look_back = look_back
+        self._takes = {name: taken_by(estimator) for name, estimator in self._estimators.items()}
+        self._unused = dict.fromkeys(self._estimators, Report((Verdict.NOT_USED,)))
+        # Most of what arrives are inertial samples, and most estimators have no use for them.
+        self._takers: dict[type[Measurement], list[str]] = {}
 
     def step(self, measurement: Measurement) -> list[Outcome]:
         """Process one measurement; a scan also yields the outcomes of its increment and of a loop closure."""
@@ -119,9 +123,15 @@ class Pipeline:
         return {name: sketch for name, sketch in shown.items() if sketch is not None}
 
     def _update(self, measurement: Measurement) -> Outcome:
-        return Outcome(
-            measurement, {name: estimator.update(measurement) for name, estimator in self._estimators.items()}
-        )
+        kind = type(measurement)
+        takers = self._takers.get(kind)
+        if takers is None:
+            takers = [name for name, taken in self._takes.items() if taken is None or kind in taken]
+            self._takers[kind] = takers
+        if not takers:
+            return Outcome(measurement, self._unused)
+        taken = {name: self._estimators[name].update(measurement) for name in takers}
+        return Outcome(measurement, taken if len(taken) == len(self._unused) else self._unused | taken)
 
 
 class Chain:

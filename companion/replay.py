@@ -19,7 +19,7 @@ from companion.log import Log, RawChunk, Truth
 from companion.pipeline import Chain, FrontEnd, Pipeline, Tick, make_parts
 from companion.range_log import HEADER, range_lines
 from drivers.framing import DecodeStats
-from estimators.base import Estimator, Report, Sketch, Sketched, Verdict
+from estimators.base import Estimator, Report, Sketch, Sketched, Taken, Verdict, taken_by
 from estimators.messages import Measurement, PoseEstimate, PoseIncrement, RangeFrame, Scan
 
 
@@ -50,6 +50,10 @@ class _TimedEstimator:
 
     def reset(self) -> None:
         self._estimator.reset()
+
+    @property
+    def takes(self) -> Taken:
+        return taken_by(self._estimator)
 
     def update(self, measurement: Measurement) -> Report:
         begin = time.perf_counter()

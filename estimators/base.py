@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Protocol, runtime_checkable
+from typing import Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 
@@ -43,6 +43,8 @@ class Verdict(StrEnum):
     """The usable anchors of the frame are too few or in line, and two positions fit alike."""
     NOT_USED = "not used"
     """This estimator has no use for such a measurement."""
+
+    __hash__ = str.__hash__  # that of enumerations is slow, and unequal for equal strings
 
     @property
     def is_nlos(self) -> bool:
@@ -166,6 +168,25 @@ class Estimator(Protocol):
     def pose_at(self, stamp_ns: int) -> PoseEstimate | None:
         """Pose at a time near the newest measurement, without changing the state; None when unknown."""
         ...
+
+
+Taken: TypeAlias = frozenset[type[Measurement]] | None
+"""Types of measurements; None stands for all."""
+
+
+@runtime_checkable
+class Selective(Estimator, Protocol):
+    """An estimator that says what it has a use for: it need not be given anything else."""
+
+    @property
+    def takes(self) -> Taken:
+        """What may change what it says, ranges always among them."""
+        ...
+
+
+def taken_by(estimator: Estimator) -> Taken:
+    """What an estimator has a use for, as far as it says so."""
+    return estimator.takes if isinstance(estimator, Selective) else None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

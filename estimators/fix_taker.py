@@ -5,8 +5,10 @@ from abc import abstractmethod
 from estimators.base import Report, Setup, Verdict
 from estimators.landmark_gate import LandmarkGate
 from estimators.lidar.keyframes import KeyframeTracker
-from estimators.messages import LandmarkFrame, Measurement, RangeFrame
+from estimators.messages import LandmarkFrame, Measurement, PoseIncrement, RangeFrame, Scan
 from estimators.range_gate import RangeGate
+
+_TAKES: frozenset[type[Measurement]] = frozenset({RangeFrame, LandmarkFrame, PoseIncrement, Scan})
 
 
 class FixTaker(KeyframeTracker):
@@ -19,6 +21,11 @@ class FixTaker(KeyframeTracker):
         self._gate = RangeGate(config, setup)
         self._landmark_gate = LandmarkGate(config, setup)
         super().__init__(config, setup)
+
+    @property
+    def takes(self) -> frozenset[type[Measurement]]:
+        """Scans are among them, for what they show of obstacles."""
+        return _TAKES
 
     def update(self, measurement: Measurement) -> Report:
         """Predict to the measurement's time and take it; scans only show what blocks ranges."""

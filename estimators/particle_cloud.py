@@ -24,7 +24,6 @@ from estimators.messages import (
     PoseIncrement,
     RangeFrame,
 )
-from estimators.models.motion import constant_velocity
 from estimators.range_gate import Candidate, RangeGate
 
 POSE, VELOCITY, KEYFRAME = slice(0, 3), slice(3, 6), slice(6, 9)
@@ -90,6 +89,12 @@ class ParticleCloud(FixTaker):
         return Sketch(particles=self._particles[:, POSE].copy())
 
     @property
+    def mean(self) -> FloatArray:
+        """Mean pose (3,) at the newest measurement: x [m], y [m], yaw [rad], map frame."""
+        mean, _ = self._cloud.moments(self._particles, self._weights, 3)
+        return mean
+
+    @property
     def gate(self) -> RangeGate:
         """What judges ranges, for those who take up where the cloud leaves off."""
         return self._gate
@@ -100,10 +105,9 @@ class ParticleCloud(FixTaker):
             return None
         mean, cov = self._cloud.moments(self._particles, self._weights, 6)
         dt = 0.0 if self._stands else (stamp_ns - self._stamp_ns) * 1e-9
-        F, Q = constant_velocity(dt, *self._accel_noise)
-        cov = F @ cov @ F.T + Q
-        cov = 0.5 * (cov + cov.T) + self._cloud.LEAST_VARIANCE * np.eye(6)
-        return self._estimate(stamp_ns, F @ mean, cov)
+        mean, cov = self._motion.predicted(mean, cov, dt, *self._accel_noise)
+        cov.flat[::7] += self._cloud.LEAST_VARIANCE
+        return self._estimate(stamp_ns, mean, cov)
 
     @abstractmethod
     def _take(self, misfits: FloatArray, measured: Likelihood) -> None:
@@ -155,29 +159,33 @@ class ParticleCloud(FixTaker):
         count = len(frame.ranges)
         verdicts = [Verdict.ACCEPTED] * count
         innovations, nis = np.full(count, np.nan), np.full(count, np.nan)
-        candidates: dict[int, Candidate] = {}
-        pose, _ = self._cloud.moments(self._particles, self._weights, 3)
-        for i, item in enumerate(self._gate.candidates(frame, pose)):
+        candidates: list[tuple[int, Candidate]] = []
+        for i, item in enumerate(self._gate.candidates(frame, self.mean)):
             if isinstance(item, Verdict):
                 verdicts[i] = item
             else:
-                candidates[i] = item
+                candidates.append((i, item))
         if not candidates:
             return Report(tuple(verdicts), innovations, nis)
         arm = self._setup.arm(frame.tag_id)
-        ranges = np.array([(c.anchor[0], c.anchor[1], c.measured, c.sigma) for c in candidates.values()])
-        mean, cov = self._likelihood.expected_residuals(self._particles, self._weights, arm, ranges)
-        for k, (i, candidate) in enumerate(candidates.items()):
+        ranges = np.array([(c.anchor[0], c.anchor[1], c.measured, c.sigma) for _, c in candidates])
+        expected = self._likelihood.expected_residuals(self._particles, self._weights, arm, ranges)
+        # In plain floats: arrays of a few numbers take longer than all of the arithmetic.
+        mean, cov = expected[0].tolist(), expected[1].tolist()
+        for k, (i, candidate) in enumerate(candidates):
+            known = cov[k]
             innovations[i] = mean[k]
-            nis[i] = mean[k] ** 2 / (cov[k, k] + candidate.sigma**2)
-            verdicts[i], factor = self._gate.judge(candidate, innovations[i], nis[i])
+            nis[i] = square = mean[k] ** 2 / (known[k] + candidate.sigma**2)
+            verdicts[i], factor = self._gate.judge(candidate, mean[k], square)
             if not verdicts[i].is_used:
                 ranges[k, 3] = np.inf
                 continue
             # What is used corrects the expectation of those after it, as in a Kalman filter.
-            ranges[k, 3] *= factor
-            gain = cov[:, k] / (cov[k, k] + ranges[k, 3] ** 2)
-            mean, cov = mean - gain * mean[k], cov - np.outer(gain, cov[k])
+            ranges[k, 3] = sigma = factor * candidate.sigma
+            for j in range(k + 1, len(candidates)):
+                gain = cov[j][k] / (known[k] + sigma**2)
+                mean[j] -= gain * mean[k]
+                cov[j] = [value - gain * other for value, other in zip(cov[j], known, strict=True)]
         if any(verdict.is_used for verdict in verdicts):
             fixes = Fixes(self._likelihood.misfits, arm, ranges, _NO_LANDMARKS)
             self._take(fixes(self._particles), fixes)

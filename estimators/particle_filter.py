@@ -74,6 +74,11 @@ class ParticleFilter(ParticleCloud):
         self._scan_sigma = config.scan_sigma
         super().__init__(config, setup)
 
+    @property
+    def takes(self) -> frozenset[type[Measurement]]:
+        """As every filter, and inertial samples if they tell the motion."""
+        return super().takes | {ImuSample} if self._uses_imu else super().takes
+
     def update(self, measurement: Measurement) -> Report:
         """Predict to the measurement's time and take it."""
         if isinstance(measurement, Scan) and self._field is not None:

@@ -1,9 +1,9 @@
 """Which ranges of a frame a filter believes, and how much: shared by all that predict them."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from math import sqrt
-from typing import Literal
+from typing import Literal, TypeAlias
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -14,12 +14,14 @@ from estimators.models.range import reduce_height
 from estimators.nlos.power import Power
 from estimators.nlos.prediction import PRIOR, Prediction, excess_log_ratio
 from estimators.nlos.robust import sigma_factor
-from estimators.nlos.visibility import Visibility
+from estimators.nlos.visibility import OBSTRUCTED, Visibility
 
 NlosMethod = Literal["prediction", "power", "visibility", "robust"]
+Reduced: TypeAlias = tuple[FloatArray, float, float]
+"""Anchor (3,), horizontal range to it and the standard deviation of that [m]."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(slots=True, eq=False)  # not frozen: that costs four times as much to make, four times a frame
 class Candidate:
     """A range that is to be held against its prediction.
 
@@ -31,7 +33,7 @@ class Candidate:
         sigma: its standard deviation [m].
         prior: log-odds of its anchor being blocked, by what was known before this frame.
         by_power: log-likelihood ratio of its powers.
-        by_visibility: the same of what the LiDAR sees.
+        pose: (3,) x [m], y [m], yaw [rad] that the body is predicted at.
     """
 
     anchor_id: int
@@ -41,12 +43,7 @@ class Candidate:
     sigma: float
     prior: float
     by_power: float
-    by_visibility: float
-
-    @property
-    def log_odds(self) -> float:
-        """Of being blocked, before the residual is looked at."""
-        return self.prior + self.by_power + self.by_visibility
+    pose: FloatArray
 
 
 class HorizontalRanges:
@@ -61,17 +58,23 @@ class HorizontalRanges:
         self._sigma = sigma
         self._anchors = {i: (anchor, setup.height_to(anchor)) for i, anchor in setup.anchors.items()}
         self._lifts = {i: float(arm[2] - setup.tag_in_body[2]) for i, arm in setup.tags.items()}
+        self._newest: tuple[RangeFrame, list[Verdict | Reduced]] | None = None
 
-    def of(self, frame: RangeFrame) -> Iterator[Verdict | tuple[FloatArray, float, float]]:
-        """For each range of a frame the anchor (3,), horizontal range and its sigma [m], or what is wrong."""
-        lift = self._lifts.get(frame.tag_id, 0.0)
-        for anchor_id, slant in zip(frame.anchor_ids.tolist(), frame.ranges.tolist(), strict=True):
-            if anchor_id not in self._anchors:
-                yield Verdict.UNKNOWN_ANCHOR
-                continue
-            anchor, height = self._anchors[anchor_id]
-            reduced = reduce_height(slant, self._sigma, height - lift)
-            yield Verdict.IMPOSSIBLE if reduced is None else (anchor, *reduced)
+    def of(self, frame: RangeFrame) -> list[Verdict | Reduced]:
+        """For each range of a frame what it is in the plane, or what is wrong with it."""
+        # A filter asks, and a graph behind it asks again.
+        if self._newest is None or self._newest[0] is not frame:
+            lift = self._lifts.get(frame.tag_id, 0.0)
+            pairs = zip(frame.anchor_ids.tolist(), frame.ranges.tolist(), strict=True)
+            self._newest = frame, [self._reduced(anchor_id, slant, lift) for anchor_id, slant in pairs]
+        return self._newest[1]
+
+    def _reduced(self, anchor_id: int, slant: float, lift: float) -> Verdict | Reduced:
+        if anchor_id not in self._anchors:
+            return Verdict.UNKNOWN_ANCHOR
+        anchor, height = self._anchors[anchor_id]
+        reduced = reduce_height(slant, self._sigma, height - lift)
+        return Verdict.IMPOSSIBLE if reduced is None else (anchor, *reduced)
 
 
 class RangeGate:
@@ -117,7 +120,8 @@ class RangeGate:
         )
 
     def __init__(self, config: Config, setup: Setup) -> None:
-        self._horizontal = HorizontalRanges(config.range_sigma, setup)
+        self.horizontal = HorizontalRanges(config.range_sigma, setup)
+        """Height reduction, for those who take up where a filter leaves off."""
         self._excess = config.nlos_excess
         self._limit = chi2.ppf(config.range_gate, 1)
         methods = config.nlos
@@ -151,9 +155,13 @@ class RangeGate:
             frame: with N ranges.
             pose: (3,) predicted x [m], y [m], yaw [rad] of the body in the map.
         """
+        reduced, pose = self.horizontal.of(frame), pose.copy()
+        signals = zip(
+            frame.anchor_ids.tolist(), frame.rx_power.tolist(), frame.fp_power.tolist(), strict=True
+        )
         return [
-            item if isinstance(item, Verdict) else self._candidate(frame, i, pose, *item)
-            for i, item in enumerate(self._horizontal.of(frame))
+            item if isinstance(item, Verdict) else self._candidate(frame.stamp_ns, pose, *signal, *item)
+            for item, signal in zip(reduced, signals, strict=True)
         ]
 
     def judge(self, candidate: Candidate, residual: float, nis: float) -> tuple[Verdict, float]:
@@ -167,7 +175,7 @@ class RangeGate:
         if nis > self._limit and residual < 0.0:
             # Nothing shortens a range: rather is the pose wrong, which says nothing of what stands between.
             return Verdict.GATED, 1.0
-        log_odds = candidate.log_odds
+        log_odds = candidate.prior + candidate.by_power
         by_residual = 0.0
         if self._looks_at_residual:
             sigma = abs(residual) / sqrt(nis) if nis > 0.0 else candidate.sigma
@@ -176,37 +184,53 @@ class RangeGate:
         if self._prediction is not None:
             known = candidate.prior + by_residual
             self._prediction.remember(candidate.anchor_id, candidate.stamp_ns, known)
+        if nis > self._limit and not self._weighs:
+            return Verdict.GATED if self._prediction is None else Verdict.TOO_LONG, 1.0
+        by_visibility = self._looked(candidate, log_odds)
+        log_odds += by_visibility
         if self._weighs:
             verdict = Verdict.DOWNWEIGHTED if log_odds > 0.0 else Verdict.ACCEPTED
             return verdict, sigma_factor(log_odds)
-        if nis > self._limit:
-            return Verdict.GATED if self._prediction is None else Verdict.TOO_LONG, 1.0
         if log_odds > 0.0:
-            return _reason(by_residual, candidate), 1.0
+            return _reason(by_residual, candidate.by_power, by_visibility), 1.0
         return Verdict.ACCEPTED, 1.0
 
     def _candidate(
-        self, frame: RangeFrame, i: int, pose: FloatArray, anchor: FloatArray, measured: float, sigma: float
+        self,
+        stamp_ns: int,
+        pose: FloatArray,
+        anchor_id: int,
+        rx_power: float,
+        fp_power: float,
+        anchor: FloatArray,
+        measured: float,
+        sigma: float,
     ) -> Candidate:
-        anchor_id, stamp_ns = int(frame.anchor_ids[i]), frame.stamp_ns
-        return Candidate(
-            anchor_id,
-            stamp_ns,
-            anchor,
-            measured,
-            sigma,
-            prior=self._prediction.prior(anchor_id, stamp_ns) if self._prediction else PRIOR,
-            by_power=self._power.log_ratio(frame.rx_power[i], frame.fp_power[i]) if self._power else 0.0,
-            by_visibility=self._visibility.log_ratio(pose, anchor) if self._visibility else 0.0,
+        prior = self._prediction.prior(anchor_id, stamp_ns) if self._prediction else PRIOR
+        by_power = self._power.log_ratio(rx_power, fp_power) if self._power else 0.0
+        return Candidate(anchor_id, stamp_ns, anchor, measured, sigma, prior, by_power, pose)
+
+    def _looked(self, candidate: Candidate, log_odds: float) -> float:
+        """What the LiDAR sees says of a range, if it can change what is thought of it.
+
+        Args:
+            candidate: the range.
+            log_odds: of its being blocked, by all else.
+        """
+        matters = self._weighs or log_odds + OBSTRUCTED > 0.0
+        return (
+            self._visibility.log_ratio(candidate.pose, candidate.anchor)
+            if self._visibility and matters
+            else 0.0
         )
 
 
-def _reason(by_residual: float, candidate: Candidate) -> Verdict:
+def _reason(by_residual: float, by_power: float, by_visibility: float) -> Verdict:
     """What spoke most for a blocked range; its anchor's past when nothing of now did."""
     reasons = {
         Verdict.TOO_LONG: by_residual,
-        Verdict.WEAK_FIRST_PATH: candidate.by_power,
-        Verdict.OBSTRUCTED: candidate.by_visibility,
+        Verdict.WEAK_FIRST_PATH: by_power,
+        Verdict.OBSTRUCTED: by_visibility,
     }
     strongest = max(reasons, key=reasons.__getitem__)
     return strongest if reasons[strongest] > 0.0 else Verdict.SUSPECT

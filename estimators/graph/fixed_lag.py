@@ -5,10 +5,17 @@ of time, behind the variables that do not move. Those older than the lag are mar
 are linearised for good and become a quadratic on the nodes that they share factors with. Time and memory of
 an update are bounded by the nodes within the lag.
 
-Source: Dong-Si and Mourikis, ICRA 2011, fixed-lag smoothing by marginalisation.
+Most updates do not solve for all of the window. What it said of its newest state, and of the pose that
+increments refer to, when it was last solved as a whole is a quadratic, too; nodes that came since are solved
+with that. All is solved and linearised anew after `_MOST_NEW` nodes, and at once when that quadratic is no
+longer good: what it is on has moved too far, or a factor goes further back.
+
+Source: Dong-Si and Mourikis, ICRA 2011, fixed-lag smoothing by marginalisation; linearising anew only what
+moved: Kaess et al., iSAM2, International Journal of Robotics Research 31(2), 2012.
 """
 
 from collections.abc import Collection
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -17,19 +24,41 @@ from estimators.graph.errors import GraphError
 from estimators.graph.factors import DensePrior, Graph
 from estimators.graph.solver import arrays
 from estimators.kernels import optimise, window
-from estimators.kernels.factors import last_use, system_of
+from estimators.kernels.factors import system_of
 from estimators.kernels.window import BoolArray
 from estimators.messages import FloatArray, IntArray
 
 _TABLES = {"increments": 2, "ranges": 2, "sightings": 2, "motions": 4, "priors": 1}
 """Leading columns of each table that are variables."""
+_MOST_NEW = 10
+"""Nodes that are solved for without the others: with more, a solution of all costs little in comparison."""
+_FARTHEST = 3.0
+"""So many times what the search tolerates may that move which old nodes say something of, until they are
+linearised anew. By default that is 3 cm and 0.03 rad; iSAM2 as GTSAM ships it waits for 0.1 of either."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Settled:
+    """A window when all of it was solved.
+
+    Attributes:
+        nodes: how many it had.
+        rows: how many factors, by the name of their table.
+        said: what all of them said of its newest state, and of a reference.
+        poses: (K,) which of those variables are poses: motion is linear in velocities.
+    """
+
+    nodes: int
+    rows: dict[str, int]
+    said: DensePrior
+    poses: BoolArray
 
 
 class FixedLag:
     """Sliding window of nodes.
 
     Attributes:
-        graph: of the window; values are those of the last `update`.
+        graph: of the window; values are those of the last `update`, older ones of one before.
         stamps_ns: (N,) instants of the nodes.
 
     Args:
@@ -42,10 +71,12 @@ class FixedLag:
     def __init__(self, known: FloatArray, width: int, iterations: int = 4, tolerance: float = 1e-2) -> None:
         self._known = len(known)
         self._width = width
+        self._all_free = np.ones((width, 3))
         self._iterations = iterations
         self._tolerance = tolerance
         self.graph = Graph(known.copy(), np.zeros_like(known))
         self.stamps_ns = np.empty(0, dtype=np.int64)
+        self._settled: _Settled | None = None
 
     def variable(self, node: int) -> int:
         """Number of a node's pose; its velocity has the next."""
@@ -53,7 +84,7 @@ class FixedLag:
 
     def node_at(self, stamp_ns: int) -> int | None:
         """The node of an instant, if the window has it."""
-        node = int(np.searchsorted(self.stamps_ns, stamp_ns))
+        node = int(self.stamps_ns.searchsorted(stamp_ns))
         return node if node < len(self.stamps_ns) and self.stamps_ns[node] == stamp_ns else None
 
     def nearest(self, stamp_ns: int) -> int:
@@ -90,16 +121,17 @@ class FixedLag:
         Returns:
             Its number; numbers of later nodes grow by one.
         """
-        node = int(np.searchsorted(self.stamps_ns, stamp_ns))
+        node = int(self.stamps_ns.searchsorted(stamp_ns))
         graph, at = self.graph, self.variable(node)
         if node < len(self.stamps_ns):
+            self._settled = None
             self._renumber(np.arange(len(graph.values)) + self._width * (np.arange(len(graph.values)) >= at))
             graph.values = np.insert(graph.values, at, state, axis=0)
             self.stamps_ns = np.insert(self.stamps_ns, node, stamp_ns)
         else:
             graph.values = np.concatenate([graph.values, state])
-            self.stamps_ns = np.append(self.stamps_ns, stamp_ns)
-        graph.free = np.concatenate([graph.free, np.full((self._width, 3), 1.0)])
+            self.stamps_ns = np.concatenate([self.stamps_ns, [stamp_ns]])
+        graph.free = np.concatenate([graph.free, self._all_free])
         return node
 
     def interpolate(self, stamp_ns: int) -> int | None:
@@ -127,24 +159,29 @@ class FixedLag:
         for name, rows in tables.items():
             setattr(self.graph, name, np.concatenate([getattr(self.graph, name), rows]))
 
-    def drop_before(self, horizon_ns: int, kept_ns: Collection[int] = ()) -> None:
-        """Marginalise what is older than the horizon.
+    def drop_before(self, horizon_ns: int, kept_ns: Collection[int] = ()) -> bool:
+        """Marginalise what is older than the horizon, once the last update was one of the whole window.
 
         Nodes at which increments to younger nodes begin stay, and so does the newest.
 
         Args:
             horizon_ns: older nodes go.
             kept_ns: instants of nodes that stay all the same.
+
+        Returns:
+            Whether any node has left.
         """
-        if len(self.stamps_ns) < 2 or self.stamps_ns[0] >= horizon_ns:
-            return
+        if len(self.stamps_ns) < 2 or self.stamps_ns[0] >= horizon_ns or self._has_new():
+            return False
         leaving = window.leaving(self.stamps_ns, horizon_ns, self.graph.increments, self._known, self._width)
         leaving[-1] = False
         for stamp_ns in kept_ns:
             if (node := self.node_at(stamp_ns)) is not None:
                 leaving[node] = False
-        if leaving.any():
-            self._marginalise(leaving)
+        if not leaving.any():
+            return False
+        self._marginalise(leaving)
+        return True
 
     def absorb(self) -> None:
         """Make all that is known of the nodes a quadratic: their factors will not be linearised again."""
@@ -165,9 +202,19 @@ class FixedLag:
         asked = [self.variable(len(self.stamps_ns) - 1) + i for i in range(self._width)]
         if reference is not None:
             asked.append(self.variable(reference))
-        values, covariance = self._optimum(asked, self._iterations)
-        self.graph.values = values
+        variables = np.array(asked)
+        covariance = self._solve_newest(variables)
+        if covariance is None:
+            self.graph.values, covariance, information = self._solve_all(variables, self._iterations)
+            at = self.graph.values[variables]
+            self._settle(DensePrior(variables, at, information, np.zeros(len(information))))
         return covariance
+
+    def _settle(self, said: DensePrior) -> None:
+        """Note what the window says now that all of it was solved."""
+        rows = {name: len(getattr(self.graph, name)) for name in _TABLES}
+        poses = (said.variables - self._known) % self._width == 0
+        self._settled = _Settled(len(self.stamps_ns), rows, said, poses)
 
     def state_of(self, node: int) -> tuple[FloatArray, FloatArray]:
         """State (3 width,) of any node and its covariance, given all that is in the window.
@@ -175,32 +222,64 @@ class FixedLag:
         Raises:
             GraphError: as `update`.
         """
-        asked = [self.variable(node) + i for i in range(self._width)]
-        return self.graph.values[asked].ravel(), self._optimum(asked, 1)[1]
+        variables = self.variable(node) + np.arange(self._width)
+        values, covariance, _ = self._solve_all(variables, 1)
+        return values[variables].ravel(), covariance
 
-    def _optimum(self, asked: list[int], iterations: int) -> tuple[FloatArray, FloatArray]:
-        """Values (V, 3) at the optimum, and the covariance of the variables asked for."""
-        graph = self.graph
-        taken = arrays(graph)
-        count = len(graph.values)
-        last_needed = last_use(taken)
-        # What is asked for goes last: its covariance is then read off the end of the factor.
-        last_needed[asked] = count + np.arange(len(asked))
-        order = np.full(count, -1, dtype=np.int64)
-        sequence = self._known + np.argsort(last_needed[self._known :], kind="stable")
-        order[sequence] = np.arange(len(sequence))
-        system = system_of(taken, order, len(sequence))
-        values = graph.values.copy()
-        status, _, _, diagonal, below = optimise.gauss_newton(
-            values, taken, system, iterations, self._tolerance
+    def _has_new(self) -> bool:
+        """Whether anything came since all was solved."""
+        settled = self._settled
+        return settled is not None and (
+            len(self.stamps_ns) > settled.nodes
+            or any(len(getattr(self.graph, name)) > count for name, count in settled.rows.items())
         )
-        if status not in (optimise.CONVERGED, optimise.NOT_CONVERGED) or not np.isfinite(values).all():
+
+    def _solve_newest(self, asked: IntArray) -> FloatArray | None:
+        """Solve for the nodes that came since all was solved; covariance of the variables asked for.
+
+        None, and all is as it was, where that would not be the optimum of the window.
+        """
+        settled, graph = self._settled, self.graph
+        if settled is None or not self._has_new() or len(self.stamps_ns) - settled.nodes > _MOST_NEW:
+            return None
+        said, values, rows = settled.said, graph.values.copy(), settled.rows
+        newer = (
+            graph.free,
+            graph.increments[rows["increments"] :],
+            graph.ranges[rows["ranges"] :],
+            graph.sightings[rows["sightings"] :],
+            graph.motions[rows["motions"] :],
+            graph.priors[rows["priors"] :],
+            said.variables,
+            said.at,
+            said.information,
+            said.gradient,
+        )
+        first = self.variable(settled.nodes)
+        status, covariance, _ = optimise.solve_window(
+            values, newer, asked, self._known, first, self._iterations, self._tolerance
+        )
+        if status not in (optimise.CONVERGED, optimise.NOT_CONVERGED):
+            return None
+        moved = np.abs(values[said.variables] - said.at)[settled.poses]
+        if moved.max() > _FARTHEST * self._tolerance:
+            return None
+        graph.values = values
+        return covariance
+
+    def _solve_all(self, asked: IntArray, iterations: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Values (V, 3) at the optimum; covariance of the variables asked for, and its inverse."""
+        values = self.graph.values.copy()
+        status, covariance, information = optimise.solve_window(
+            values, arrays(self.graph), asked, self._known, self._known, iterations, self._tolerance
+        )
+        if status not in (optimise.CONVERGED, optimise.NOT_CONVERGED):
             raise GraphError("window: something in it is not determined, or not finite")
-        covariance = optimise.last_covariance(system[1], system[2], diagonal, below, len(asked))
-        return values, covariance
+        return values, covariance, information
 
     def _marginalise(self, leaving: BoolArray, everything: bool = False) -> None:
         """Linearise the factors on nodes that leave, or all factors, and keep what they say of the rest."""
+        settled, self._settled = self._settled, None
         graph, count = self.graph, len(self.graph.values)
         gone = np.zeros(count, dtype=np.bool_)
         gone[self._known :] = np.repeat(leaving, self._width)
@@ -225,6 +304,8 @@ class FixedLag:
         graph.dense = DensePrior(numbers[staying], graph.values[staying], information, gradient)
         graph.values, graph.free = graph.values[~gone], graph.free[~gone]
         self.stamps_ns = self.stamps_ns[~leaving]
+        if settled is not None and not everything and not gone[settled.said.variables].any():
+            self._settle(replace(settled.said, variables=numbers[settled.said.variables]))
 
     def _renumber(self, numbers: IntArray) -> None:
         """Give every variable a new number (V,), in tables and prior."""

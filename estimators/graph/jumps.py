@@ -1,5 +1,7 @@
 """When a correction is a jump that `PoseEstimate.reset_counter` counts, as it does poses set from outside."""
 
+from math import radians
+
 import numpy as np
 
 from estimators import chi2
@@ -8,7 +10,7 @@ from estimators.messages import FloatArray
 
 _LIMIT = float(chi2.ppf(1.0 - 1e-6, 3))
 """What a covariance explains of a correction, but for one in a million."""
-_LEAST = np.array([0.05, 0.05, np.deg2rad(2.0)])
+_LEAST = (0.05, 0.05, radians(2.0))
 """Corrections below these [m, m, rad] are no jump, however sure the estimate was."""
 
 
@@ -24,4 +26,6 @@ def is_jump(before: FloatArray, cov: FloatArray, after: FloatArray) -> bool:
     """
     step = after - before
     step[2] = wrap_angle(step[2])
-    return bool((np.abs(step) > _LEAST).any() and step @ np.linalg.solve(cov, step) > _LIMIT)
+    if all(abs(moved) <= least for moved, least in zip(step.tolist(), _LEAST, strict=True)):
+        return False
+    return bool(step @ np.linalg.solve(cov, step) > _LIMIT)

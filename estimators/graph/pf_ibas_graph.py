@@ -7,7 +7,6 @@ from estimators.geometry import wrap_angle
 from estimators.graph.smoother import GraphSmoother
 from estimators.messages import FloatArray, LandmarkFrame, Measurement, RangeFrame
 from estimators.pf_ibas import PfIbas
-from estimators.range_gate import HorizontalRanges
 
 
 class PfIbasGraph(GraphSmoother):
@@ -24,9 +23,13 @@ class PfIbasGraph(GraphSmoother):
 
     def __init__(self, config: Config, setup: Setup) -> None:
         self._filter = PfIbas(config, setup)
-        self._horizontal = HorizontalRanges(config.range_sigma, setup)
         super().__init__(config, setup)
         self._gate = self._filter.gate
+
+    @property
+    def takes(self) -> frozenset[type[Measurement]]:
+        """What filter or graph takes."""
+        return super().takes | self._filter.takes
 
     def reset(self) -> None:
         """Stand at the start again, filter and graph."""
@@ -51,7 +54,7 @@ class PfIbasGraph(GraphSmoother):
         if not isinstance(frame, RangeFrame) or Verdict.LATE in self._said.verdicts:
             return super()._judge(frame, mean, cov)
         rows = self._judging.believed_ranges(
-            self._horizontal,
+            self._gate.horizontal,
             frame,
             self._said.verdicts,
             self._setup.arm(frame.tag_id),
@@ -60,8 +63,10 @@ class PfIbasGraph(GraphSmoother):
         return self._taken(frame.stamp_ns, "ranges", rows, self._said)
 
     def _guess(self, stamp_ns: int) -> FloatArray:
-        state, pose = super()._guess(stamp_ns), self._filter.pose_at(stamp_ns)
-        if pose is not None:
-            turn = wrap_angle(pose.yaw - float(state[0, 2]))
-            state[0] = *pose.xy, state[0, 2] + turn
+        state, pose = (
+            super()._guess(stamp_ns),
+            self._filter.mean,
+        )  # of this instant: it has taken what is there
+        turn = wrap_angle(float(pose[2] - state[0, 2]))
+        state[0] = pose[0], pose[1], state[0, 2] + turn
         return state

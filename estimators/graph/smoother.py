@@ -23,8 +23,9 @@ from estimators.messages import (
     PoseEstimate,
     PoseIncrement,
     RangeFrame,
+    Scan,
 )
-from estimators.models.motion import constant_velocity, increment
+from estimators.models.motion import increment
 from estimators.range_gate import RangeGate
 
 SAME_NS = 1_000_000
@@ -32,6 +33,10 @@ SAME_NS = 1_000_000
 POSE, VELOCITY, REFERENCE, STATE = slice(0, 3), slice(3, 6), slice(6, 9), slice(0, 6)
 _WIDEST = np.array([100.0, 100.0, np.pi, 10.0, 10.0, 10.0])
 """Standard deviations [m, rad, m/s, rad/s] beyond which a window that begins anew knows nothing at all."""
+
+_TAKES: frozenset[type[Measurement]] = frozenset(
+    {RangeFrame, LandmarkFrame, PoseIncrement, LoopClosure, Scan}
+)
 
 
 class GraphSmoother(KeyframeTracker):
@@ -58,9 +63,10 @@ class GraphSmoother(KeyframeTracker):
     def __init__(self, config: Config, setup: Setup) -> None:
         # Numba loads slowly: only who makes a smoother waits for it.
         from estimators.graph import fixed_lag, judging
+        from estimators.kernels import motion
 
         super().__init__(config, setup)
-        self._fixed_lag, self._judging = fixed_lag, judging
+        self._fixed_lag, self._judging, self._motion = fixed_lag, judging, motion
         self._lag_ns = round(config.lag * 1e9)
         self._most_places = config.places
         self._gate = RangeGate(config, setup)
@@ -72,6 +78,11 @@ class GraphSmoother(KeyframeTracker):
         places = [*(p[:2] for p in setup.anchors.values()), *setup.landmarks.values()]
         self._known = np.array([[*place, 0.0] for place in places]).reshape(-1, 3)
         self.reset()
+
+    @property
+    def takes(self) -> frozenset[type[Measurement]]:
+        """Scans are among them, for what they show of obstacles."""
+        return _TAKES
 
     @property
     def state(self) -> tuple[FloatArray, FloatArray]:
@@ -284,9 +295,9 @@ class GraphSmoother(KeyframeTracker):
         kept = [*self._places.values()]
         if self._reference_stamp_ns is not None:
             kept.append(self._keyframes.get(self._reference_stamp_ns, 0))
-        window.drop_before(int(window.stamps_ns[-1]) - self._lag_ns, kept)
-        nodes_ns = set(window.stamps_ns.tolist())
-        self._keyframes = {k: node_ns for k, node_ns in self._keyframes.items() if node_ns in nodes_ns}
+        if window.drop_before(int(window.stamps_ns[-1]) - self._lag_ns, kept):
+            nodes_ns = set(window.stamps_ns.tolist())
+            self._keyframes = {k: node_ns for k, node_ns in self._keyframes.items() if node_ns in nodes_ns}
         return True
 
     def _begin_window(self, stamp_ns: int) -> None:
@@ -301,22 +312,18 @@ class GraphSmoother(KeyframeTracker):
     def _predicted(self, stamp_ns: int) -> tuple[FloatArray, FloatArray]:
         """State (9,) and covariance (9, 9) at an instant near the newest node."""
         dt = 0.0 if self._stands else (stamp_ns - int(self._window.stamps_ns[-1])) * 1e-9
-        F, Q = np.eye(9), np.zeros((9, 9))
-        F[STATE, STATE], Q[STATE, STATE] = constant_velocity(dt, *self._accel_noise)
-        cov = F @ self._cov @ F.T + Q
-        return F @ self._mean, 0.5 * (cov + cov.T)
+        return self._motion.predicted(self._mean, self._cov, dt, *self._accel_noise)
 
     def _node_of(self, stamp_ns: int) -> int | None:
         """The node of an instant, made if there is none yet; None when the window does not reach back."""
         window = self._window
-        if stamp_ns < window.stamps_ns[0]:
-            return None
-        nearest = window.nearest(stamp_ns)
-        if abs(int(window.stamps_ns[nearest]) - stamp_ns) < SAME_NS:
-            return nearest
         newest_ns = int(window.stamps_ns[-1])
-        if stamp_ns < newest_ns:
-            return window.interpolate(stamp_ns)
+        if stamp_ns < newest_ns + SAME_NS:
+            if stamp_ns < window.stamps_ns[0]:
+                return None
+            nearest = window.nearest(stamp_ns)
+            is_there = abs(int(window.stamps_ns[nearest]) - stamp_ns) < SAME_NS
+            return nearest if is_there else window.interpolate(stamp_ns)
         self._mean, self._cov = self._predicted(stamp_ns)
         node = window.insert(stamp_ns, self._guess(stamp_ns))
         ends = window.variable(node - 1), window.variable(node)

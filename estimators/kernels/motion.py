@@ -118,3 +118,40 @@ def take_increment(
         particle[4] = s * motion[i, 3] + c * motion[i, 4]
         particle[5] = motion[i, 5]
     return float(nis)
+
+
+@compiled(f"Tuple(({VECTOR}, {MATRIX}))({VECTOR}, {MATRIX}, float64, float64, float64)")
+def predicted(
+    mean: FloatArray, cov: FloatArray, dt: float, accel_noise: float, yaw_accel_noise: float
+) -> tuple[FloatArray, FloatArray]:
+    """A state after a time step with constant velocity and white acceleration.
+
+    Args:
+        mean: (N,) pose, velocity along the map's axes, anything that does not move.
+        cov: (N, N) of the same.
+        dt: time step [s]; negative steps look back, their noise is that of the positive step.
+        accel_noise: density of the white acceleration [m/s^2/sqrt(Hz)].
+        yaw_accel_noise: density of the white angular acceleration [rad/s^2/sqrt(Hz)].
+
+    Returns:
+        Mean (N,) and covariance (N, N), symmetric.
+
+    Source: `models.motion.constant_velocity`, F m and F P F^T + Q.
+    """
+    count, step = len(mean), abs(dt)
+    mean, moved = mean.copy(), cov.copy()
+    for i in range(3):
+        mean[i] += dt * mean[3 + i]
+        for j in range(count):
+            moved[i, j] += dt * moved[3 + i, j]
+    for i in range(count):
+        for j in range(3):
+            moved[i, j] += dt * moved[i, 3 + j]
+    for i in range(3):
+        density = yaw_accel_noise if i == 2 else accel_noise
+        power = density * density
+        moved[i, i] += power * step**3 / 3.0
+        moved[i, 3 + i] += power * step * dt / 2.0
+        moved[3 + i, i] += power * step * dt / 2.0
+        moved[3 + i, 3 + i] += power * step
+    return mean, 0.5 * (moved + moved.T)

@@ -37,6 +37,7 @@ class Visibility:
 
     def __init__(self, obstacle_height: float, setup: Setup) -> None:
         self._obstacle_height = obstacle_height
+        self._arm = setup.tag_in_body.tolist()
         self._setup = setup
         self.reset()
 
@@ -75,9 +76,7 @@ class Visibility:
         if not self.grid.log_odds.size:
             return 0.0
         # In plain floats: arrays of two numbers take longer than all of the arithmetic.
-        (x, y, yaw), (arm_x, arm_y, _), (to_x, to_y, height) = (
-            values.tolist() for values in (pose, self._setup.tag_in_body, anchor)
-        )
+        (x, y, yaw), (to_x, to_y, height), (arm_x, arm_y, _) = pose.tolist(), anchor.tolist(), self._arm
         c, s = cos(yaw), sin(yaw)
         tag_x, tag_y = x + c * arm_x - s * arm_y, y + s * arm_x + c * arm_y
         length = hypot(to_x - tag_x, to_y - tag_y)

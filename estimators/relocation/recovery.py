@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from estimators.base import Report, Settable, Setup, Sketch, Sketched, Verdict
+from estimators.base import Report, Settable, Setup, Sketch, Sketched, Taken, Verdict, taken_by
 from estimators.geometry import compose, inverse
 from estimators.messages import FloatArray, Measurement, PoseEstimate, PoseIncrement, RangeFrame, Scan
 from estimators.range_gate import HorizontalRanges
@@ -102,6 +102,12 @@ class Recovering:
         self._note = "" if self._known else self._doubt(None)
         self._searched_ns: int | None = None
         self._set_ns: int | None = None
+
+    @property
+    def takes(self) -> Taken:
+        """What the filter takes, if it says so; the search needs ranges, scans and increments."""
+        taken = taken_by(self._wrapped)
+        return None if taken is None else taken | {RangeFrame, Scan, PoseIncrement}
 
     def update(self, measurement: Measurement) -> Report:
         """Take one measurement; while the pose is looked for, the report's note says what is missing."""

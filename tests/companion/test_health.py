@@ -4,6 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from companion.config import HealthTable
 from companion.health import HealthMonitor, State, uwb_line
@@ -256,3 +258,18 @@ def test_after_a_reset_ranges_must_confirm_the_pose_before_it_is_sent_again() ->
     assert set(states[:20]) == {State.OK}
     assert set(states[20:30]) == {State.LOST}
     assert set(states[40:]) == {State.OK}
+
+
+@settings(deadline=None)
+@given(st.floats(0.45, 0.75), st.floats(0.01, 1.0), st.floats(0.6, 0.9))
+def test_a_position_is_as_uncertain_as_along_the_longer_axis_of_its_ellipse(
+    longer: float, share: float, turn: float
+) -> None:
+    c, s = np.cos(turn), np.sin(turn)
+    axes = np.array([[c, -s], [s, c]])
+    cov = np.eye(6) * 1e-4
+    cov[:2, :2] = axes @ np.diag([longer**2, (share * longer) ** 2]) @ axes.T
+    judged = monitor_at(1.0).judge(pose(cov), SECOND)
+    limit = HealthTable.model_validate({}).max_sigma_xy
+    if abs(longer - limit) > 1e-6:
+        assert ("position sigma" in judged.reason) == (longer > limit)

@@ -8,12 +8,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from estimators import ESTIMATORS, estimator_config_class, make_estimator
-from estimators.base import Estimator, Report, Verdict
+from estimators.base import Estimator, Report, Verdict, taken_by
 from estimators.messages import (
     Attitude,
     FloatArray,
+    Height,
     ImuSample,
     LandmarkFrame,
+    LoopClosure,
     Measurement,
     PoseEstimate,
     PoseIncrement,
@@ -21,6 +23,7 @@ from estimators.messages import (
     Scan,
     measurement_stamp_ns,
 )
+from estimators.relocation.recovery import Recovering
 from tests.strategies import HOUR_NS, SETUP, hostile_streams, range_frame
 
 EVERY_ESTIMATOR = pytest.mark.parametrize("name", sorted(ESTIMATORS))
@@ -284,3 +287,40 @@ def test_other_sensors_get_one_verdict(name: str, measurement: Measurement) -> N
     pose = estimator.pose_at(2 * SECOND_NS)
     assert pose is not None
     assert_pose_is_sound(pose, 2 * SECOND_NS)
+
+
+@EVERY_ESTIMATOR
+def test_what_an_estimator_does_not_take_changes_nothing(name: str) -> None:
+    estimator, undisturbed = started(name), started(name)
+    taken = taken_by(estimator)
+    assert taken is None or RangeFrame in taken
+    now_ns, zeros = 2 * SECOND_NS + 1000, np.zeros(3)
+    others: list[Measurement] = [
+        ImuSample(now_ns, zeros, np.array([0.0, 0.0, 9.81])),
+        Attitude(now_ns, np.array([1.0, 0.0, 0.0, 0.0])),
+        Height(now_ns, 1.0, 0.1),
+        LoopClosure(0, 2 * SECOND_NS, zeros, SMALL_COV),
+        Scan(now_ns, np.arange(3.0), np.ones(3), 1e-9 * np.arange(3.0), np.zeros(3)),
+    ]
+    idle = [m for m in others if taken is not None and type(m) not in taken]
+    for measurement in idle:
+        assert estimator.update(measurement).verdicts == (Verdict.NOT_USED,)
+    following: list[Measurement] = [
+        good_ranges(now_ns + 1000),
+        PoseIncrement(2 * SECOND_NS, now_ns + 2000, zeros, SMALL_COV, False),
+    ]
+    assert run(estimator, following) == run(undisturbed, following)
+
+
+@pytest.mark.parametrize(("motion", "uses"), [("imu", True), ("increments", False)])
+@pytest.mark.parametrize("name", ["pf", "pf_ibas", "pf_ibas_graph"])
+def test_inertial_samples_are_taken_by_those_whose_motion_they_tell(
+    name: str, motion: str, uses: bool
+) -> None:
+    config = estimator_config_class(name).model_validate({"motion": motion})
+    for relocation in (None, Recovering.Config()):
+        taken = taken_by(make_estimator(name, config, SETUP, relocation))
+        assert taken is not None
+        assert (ImuSample in taken) is uses
+        assert {RangeFrame, PoseIncrement, Scan} <= taken
+        assert (LoopClosure in taken) is (name == "pf_ibas_graph")

@@ -184,3 +184,25 @@ def test_late_measurements_change_nothing() -> None:
     assert before is not None
     assert after is not None
     assert before.T_map_body.tobytes() == after.T_map_body.tobytes()
+
+
+def test_each_range_of_a_frame_is_judged_with_what_those_before_it_said() -> None:
+    pf = ParticleFilter(ParticleFilter.Config(particles=500, nlos=()), HALL)
+    particles, _ = pf.particles
+    frame = true_ranges(0, HALL.start.pose + np.array([0.1, -0.1, 0.0]), HALL)
+    x, y, yaw = particles[:, :3].T
+    arm_x, arm_y, _ = HALL.tag_in_body
+    c, s = np.cos(yaw), np.sin(yaw)
+    tags = np.column_stack([x + c * arm_x - s * arm_y, y + s * arm_x + c * arm_y])
+    anchors = np.array(list(HALL.anchors.values()))
+    heights = np.array([HALL.height_to(anchor) for anchor in anchors])
+    measured = np.sqrt(frame.ranges**2 - heights**2)
+    sigmas = ParticleFilter.Config().range_sigma * frame.ranges / measured
+    misses = measured - np.linalg.norm(tags[:, None] - anchors[:, :2], axis=2)
+    # Whitened by the Cholesky factor of their covariance, each is conditioned on those before it.
+    root = np.linalg.cholesky(np.cov(misses.T, bias=True) + np.diag(sigmas**2))
+    white = np.linalg.solve(root, misses.mean(axis=0))
+    report = pf.update(frame)
+    assert set(report.verdicts) == {Verdict.ACCEPTED}
+    np.testing.assert_allclose(report.nis, white**2, rtol=1e-6)
+    np.testing.assert_allclose(report.residuals, white * np.diag(root), rtol=1e-6)

@@ -236,3 +236,21 @@ def test_ten_seconds_without_a_range_to_believe_leave_a_pose_whose_doubt_grows(
     assert sigmas[24] < sigmas[48]
     if not np.isfinite(excess) or excess < 0.0:
         assert sigmas[48] < sigmas[148] < sigmas[248]
+
+
+def test_a_line_of_sight_is_looked_along_only_where_it_may_matter(monkeypatch: pytest.MonkeyPatch) -> None:
+    looks: list[int] = []
+
+    def look(*_: object) -> float:
+        looks.append(1)
+        return OBSTRUCTED
+
+    monkeypatch.setattr(Visibility, "log_ratio", look)
+    of = gate("prediction", "power", "visibility")
+    assert [judged(of, k, 0.0, CLEAR) for k in range(20)] == [Verdict.ACCEPTED] * 20
+    assert not looks  # a clear first path and a range that fits outweigh any obstacle
+    assert judged(of, 21, 0.3, WEAK) in {Verdict.WEAK_FIRST_PATH, Verdict.OBSTRUCTED, Verdict.TOO_LONG}
+    assert len(looks) == 1
+    soft = gate("robust", "visibility")
+    judged(soft, 0, 0.0)
+    assert len(looks) == 2

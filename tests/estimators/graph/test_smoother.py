@@ -256,6 +256,7 @@ def test_a_correction_that_the_covariance_explains_is_no_jump() -> None:
     before = np.array([1.0, 2.0, np.pi - 0.01])
     assert not is_jump(before, cov, before + np.array([0.3, 0.0, 0.0]))
     assert not is_jump(before, 1e-6 * cov, before + np.array([0.04, 0.0, 0.0]))  # too small to matter
+    assert is_jump(before, 1e-6 * cov, before + np.array([0.0, 0.06, 0.0]))
     assert is_jump(before, cov, before + np.array([0.6, 0.0, 0.0]))
     assert is_jump(before, cov, before + np.array([0.0, 0.0, 0.4]))
     assert not is_jump(before, cov, np.array([1.0, 2.0, -np.pi + 0.01]))  # the same heading, nearly

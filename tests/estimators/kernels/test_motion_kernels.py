@@ -81,3 +81,19 @@ def test_a_near_perfect_increment_puts_every_particle_there() -> None:
     increment = np.array([0.3, -0.1, 0.2])
     motion.take_increment(particles, weights, noise, increment, 1e-14 * np.eye(3), np.inf)
     np.testing.assert_allclose(in_keyframe(particles)[:, :3], np.tile(increment, (60, 1)), atol=1e-6)
+
+
+@SEEDS
+@pytest.mark.parametrize("dt", [0.3, -0.2, 0.0])
+@pytest.mark.parametrize("size", [6, 9])
+def test_a_state_is_predicted_as_by_the_model(seed: int, dt: float, size: int) -> None:
+    rng = np.random.default_rng(seed)
+    mean, factor = rng.normal(size=size), rng.normal(size=(size, size))
+    F, Q = np.eye(size), np.zeros((size, size))
+    F[:6, :6], Q[:6, :6] = constant_velocity(dt, 0.5, 1.5)
+    before = factor @ factor.T
+    found, cov = motion.predicted(mean, before, dt, 0.5, 1.5)
+    np.testing.assert_allclose(found, F @ mean, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(cov, F @ before @ F.T + Q, rtol=1e-12, atol=1e-12)
+    np.testing.assert_array_equal(cov, cov.T)
+    np.testing.assert_array_equal(before, factor @ factor.T)
