@@ -119,13 +119,13 @@ def circle_intersections(
     square = first_range**2 - along**2
     unit = base / length
     if square <= 0.0:
-        if first_range > length + second_range:
-            along = 0.5 * (first_range + length + second_range)
-        elif second_range > length + first_range:
-            along = 0.5 * (length - first_range - second_range)
-        else:
-            along = 0.5 * (first_range + length - second_range)
-        return (first + along * unit,)
+        # Apart, or one within the other, or touching, which rounding takes for either.
+        nearest = max(
+            (length - first_range - second_range, first_range + length - second_range),
+            (first_range - second_range - length, first_range + length + second_range),
+            (second_range - first_range - length, length - first_range - second_range),
+        )
+        return (first + 0.5 * nearest[1] * unit,)
     across = np.sqrt(square) * np.array([-unit[1], unit[0]])
     foot = first + along * unit
     return foot + across, foot - across
