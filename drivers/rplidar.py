@@ -212,14 +212,16 @@ class Rplidar:
             self._clock.restart()
             if self._revolution is not None:
                 self._revolution.spoil()
+        starts = np.flatnonzero(samples.starts)
+        self._clock.note_starts(samples.first + starts)
         times_ns = self._sample_times(samples, arrival_ns)
         quality = samples.quality if samples.scan_type in _WITH_QUALITY else np.zeros_like(times_ns)
         table = np.stack((samples.angle_q14, samples.distance_q2, quality, times_ns))
         scans: list[Scan] = []
-        starts = np.flatnonzero(samples.starts).tolist()
+        begins = starts.tolist()
         if self._revolution is not None:
-            self._revolution.add(table[:, : starts[0] if starts else None])
-        for first, end in pairwise([*starts, table.shape[1]]):
+            self._revolution.add(table[:, : begins[0] if begins else None])
+        for first, end in pairwise([*begins, table.shape[1]]):
             if self._revolution is not None:
                 scan = self._revolution.scan(self._config.min_range, self._config.max_range)
                 if scan is None:

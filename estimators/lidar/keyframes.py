@@ -66,6 +66,8 @@ class KeyframeTracker(ABC):
                 return Report((Verdict.LATE,))
             report = self._update_increment(measurement)
             if measurement.is_keyframe:
+                if report.verdicts != (Verdict.ACCEPTED,):
+                    self._begin_anew()  # the new reference is tied to no earlier one
                 self._take_reference()
                 self._reference_stamp_ns = measurement.stamp_ns
             return report
