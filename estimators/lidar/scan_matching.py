@@ -220,8 +220,8 @@ class ScanMatcher:
         fit = settle(keyframe, found, basis, prior, predicted, start, self._ranges_to_walls(found))
         if fit is None:
             return None
-        # A bare wall looks the same everywhere, and half of a room like half of it the other way round: after a
-        # long gap it is only known to be the one when all fits.
+        # A bare wall looks the same everywhere, and half of a room like half of it turned round: after a long
+        # gap it is only known to be the one when all fits.
         has_wandered = float(np.sqrt(Q[0, 0])) > config.max_correspondence
         least_share = max(config.min_inlier_share, KEYFRAME_SHARE * has_wandered)
         is_another = has_wandered and np.linalg.matrix_rank(fit.held, tol=0.5) < 3
