@@ -1,24 +1,27 @@
-"""Anchors whose ranges contradict all others: moved, surveyed wrongly or misread, and left out for a while."""
+"""Anchors whose ranges contradict those of the others: moved, surveyed wrongly or misread; left out for a while."""
 
 from dataclasses import dataclass
 from math import sqrt
+from statistics import median
 
 SPAN = 30
 """Over about so many ranges of an anchor its residuals are averaged."""
 LEAST = 10
 """A mean of fewer says nothing."""
-CLIPPED = 3.0
+CLIPPED = 2.0
 """Sigmas beyond which a residual counts no more: single outliers are no displacement."""
+ALLOWED = 0.6
+"""Share of a range's sigma by which residuals may err on average: some 5 sigmas of their mean."""
 DOUBT = 3.0
-"""Sigmas of the pose that a mean is allowed on top of the sigma of a range."""
+"""Sigmas of the pose by which they may err besides."""
 AGREES = 0.5
 """Share of what is allowed below which an anchor that is left out agrees again."""
 PROBATION = 10.0
 """It must agree for so long [s] before it is believed again, twice as long at every further time."""
 RECENT = 2.0
-"""An anchor that was last heard longer ago [s] is no witness against another."""
+"""What was last heard longer ago [s], an anchor or odometry, is no witness."""
 WITNESSES = 2
-"""So many others must agree with the pose, or an anchor alone is not to blame."""
+"""So many other anchors must be believed, or one alone is not to blame."""
 
 
 @dataclass(slots=True)
@@ -35,8 +38,9 @@ class _Record:
     agrees_since_ns: int | None = None
     times: int = 0
 
-    def note(self, residual: float, variance: float, sigma: float) -> None:
+    def note(self, stamp_ns: int, residual: float, variance: float, sigma: float) -> None:
         bound = CLIPPED * sqrt(variance)
+        self.stamp_ns = stamp_ns
         self.count += 1
         share = 1.0 / min(self.count, SPAN)
         self.mean += share * (min(max(residual, -bound), bound) - self.mean)
@@ -44,30 +48,35 @@ class _Record:
 
 
 class AnchorTrust:
-    """Leaves out an anchor whose ranges err by more than a range's sigma on average.
+    """Leaves out an anchor whose ranges err otherwise than those of the others on average.
 
     A filter draws the pose towards an anchor that stands elsewhere than the site file says, and its residuals
-    fade. But the odometry holds the pose for a while, so they do not fade at once, and the mean of some tens
-    of them is known far better than a single one. Ranges of an anchor that is left out say how the pose,
-    which then owes them nothing, agrees with it.
+    fade. But odometry holds the pose for a while, so they do not fade at once, and the mean of some tens of
+    them is known far better than a single one. Without odometry nothing holds the pose, and every anchor is
+    believed. What all anchors err by alike is a bias of the tag, and no anchor's fault.
 
-    With n anchors no more than (n - 2) / 2 are left out, and only while others agree. Beyond that nobody can
-    tell whose fault it is, and no anchor is believed until the pose that odometry carries on agrees with it.
+    With n anchors at most (n - 2) / 2 are left out: more cannot be told from a wrong pose. Ranges of an
+    anchor that is left out show whether the pose, which owes them nothing, agrees with it again.
 
     Args:
         anchors: how many the site has.
 
-    Source: fault detection and exclusion by averaged innovations, Diesel and Luu, "GPS/IRS AIME", ION GPS
-    1995; how many can be told apart: the majority that a redundancy of n - 2 leaves.
+    Source: Diesel and Luu, "GPS/IRS AIME: Calculation of thresholds and protection radius using chi-square
+    methods", ION GPS 1995, for averaged innovations that inertial memory keeps honest.
     """
 
     def __init__(self, anchors: int) -> None:
-        self._most = (anchors - 2) // 2
+        self._most = max((anchors - 2) // 2, 0)
         self.reset()
 
     def reset(self) -> None:
         """Believe every anchor."""
         self._records: dict[int, _Record] = {}
+        self._odometry_ns: int | None = None
+
+    def note_odometry(self, stamp_ns: int) -> None:
+        """Odometry came."""
+        self._odometry_ns = stamp_ns
 
     def believes(self, anchor_id: int) -> bool:
         """Whether an anchor's ranges may be used."""
@@ -84,27 +93,42 @@ class AnchorTrust:
             variance: of the residual [m^2], the pose's share included.
             sigma: of the range alone [m].
         """
+        if not self._most:
+            return
+        if self._odometry_ns is None or not _is_recent(self._odometry_ns, stamp_ns):
+            self._records.clear()
+            return
         record = self._records.setdefault(anchor_id, _Record())
-        record.note(residual, variance, sigma)
-        record.stamp_ns = stamp_ns
-        off = abs(record.mean) / sqrt(sigma**2 + DOUBT**2 * record.by_pose)
-        if record.agrees_since_ns is None:
-            if record.count >= LEAST and off > 1.0:
-                self._leave_out(record, stamp_ns)
-        elif off > AGREES:
+        record.note(stamp_ns, residual, variance, sigma)
+        if record.count < LEAST:
+            return
+        witnesses = [
+            other.mean
+            for other in self._records.values()
+            if other is not record
+            and other.agrees_since_ns is None
+            and other.count >= LEAST
+            and _is_recent(other.stamp_ns, stamp_ns)
+        ]
+        common = median(witnesses) if len(witnesses) >= WITNESSES else 0.0
+        off = abs(record.mean - common) / sqrt((ALLOWED * sigma) ** 2 + DOUBT**2 * record.by_pose)
+        if record.agrees_since_ns is not None:
+            self._try(record, off, stamp_ns)
+        elif off > 1.0 and len(witnesses) >= WITNESSES and self._left_out() < self._most:
+            record.agrees_since_ns = stamp_ns
+            record.times += 1
+
+    def _left_out(self) -> int:
+        return sum(record.agrees_since_ns is not None for record in self._records.values())
+
+    def _try(self, record: _Record, off: float, stamp_ns: int) -> None:
+        """Believe an anchor again that has agreed for long enough."""
+        assert record.agrees_since_ns is not None
+        if off > AGREES:
             record.agrees_since_ns = stamp_ns
         elif stamp_ns - record.agrees_since_ns > PROBATION * 1e9 * 2 ** (record.times - 1):
             record.agrees_since_ns = None
 
-    def _leave_out(self, record: _Record, stamp_ns: int) -> None:
-        believed = [other for other in self._records.values() if other.agrees_since_ns is None]
-        witnesses = [
-            other
-            for other in believed
-            if other is not record and other.count >= LEAST and stamp_ns - other.stamp_ns <= RECENT * 1e9
-        ]
-        left_out = len(self._records) - len(believed)
-        is_alone = left_out < self._most and len(witnesses) >= WITNESSES
-        for blamed in [record] if is_alone else believed:
-            blamed.agrees_since_ns = stamp_ns
-            blamed.times += 1
+
+def _is_recent(stamp_ns: int, now_ns: int) -> bool:
+    return (now_ns - stamp_ns) * 1e-9 <= RECENT

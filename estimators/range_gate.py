@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from estimators import chi2
 from estimators.anchor_trust import AnchorTrust
 from estimators.base import Setup, Verdict
-from estimators.messages import FloatArray, Measurement, PoseEstimate, RangeFrame
+from estimators.messages import FloatArray, Measurement, PoseEstimate, PoseIncrement, RangeFrame
 from estimators.models.range import reduce_height
 from estimators.nlos.power import Power
 from estimators.nlos.prediction import PRIOR, Prediction, excess_log_ratio
@@ -143,6 +143,8 @@ class RangeGate:
 
     def see(self, measurement: Measurement, pose_at: Callable[[int], PoseEstimate | None]) -> None:
         """Look at what is no range; `pose_at` is that of the filter, which has taken the measurement."""
+        if isinstance(measurement, PoseIncrement):
+            self._trust.note_odometry(measurement.stamp_ns)
         if self._visibility is not None:
             self._visibility.see(measurement, pose_at)
 
