@@ -20,8 +20,6 @@ PROBATION = 10.0
 """It must agree for so long [s] before it is believed again, twice as long at every further time."""
 RECENT = 2.0
 """What was last heard longer ago [s], an anchor or odometry, is no witness."""
-WITNESSES = 2
-"""So many other anchors must be believed, or one alone is not to blame."""
 
 
 @dataclass(slots=True)
@@ -110,11 +108,11 @@ class AnchorTrust:
             and other.count >= LEAST
             and _is_recent(other.stamp_ns, stamp_ns)
         ]
-        common = median(witnesses) if len(witnesses) >= WITNESSES else 0.0
-        off = abs(record.mean - common) / sqrt((ALLOWED * sigma) ** 2 + DOUBT**2 * record.by_pose)
+        common = median(witnesses) if len(witnesses) > 1 else 0.0
+        off = min(abs(record.mean), abs(record.mean - common)) / sqrt((ALLOWED * sigma) ** 2 + DOUBT**2 * record.by_pose)
         if record.agrees_since_ns is not None:
             self._try(record, off, stamp_ns)
-        elif off > 1.0 and len(witnesses) >= WITNESSES and self._left_out() < self._most:
+        elif off > 1.0 and witnesses and self._left_out() < self._most:
             record.agrees_since_ns = stamp_ns
             record.times += 1
 
