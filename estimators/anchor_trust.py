@@ -1,4 +1,4 @@
-"""Anchors whose ranges contradict those of the others: moved, surveyed wrongly or misread; left out for a while."""
+"""Anchors whose ranges contradict the others': moved, surveyed wrongly or misread, and left out for a while."""
 
 from dataclasses import dataclass
 from math import sqrt
@@ -6,8 +6,8 @@ from statistics import median
 
 SPAN = 30
 """Over about so many ranges of an anchor its residuals are averaged."""
-LEAST = 10
-"""A mean of fewer says nothing."""
+LEAST = 60
+"""Until so many were heard their mean is not known that well."""
 CLIPPED = 2.0
 """Sigmas beyond which a residual counts no more: single outliers are no displacement."""
 ALLOWED = 0.6
@@ -108,8 +108,10 @@ class AnchorTrust:
             and other.count >= LEAST
             and _is_recent(other.stamp_ns, stamp_ns)
         ]
-        common = median(witnesses) if len(witnesses) > 1 else 0.0
-        off = min(abs(record.mean), abs(record.mean - common)) / sqrt((ALLOWED * sigma) ** 2 + DOUBT**2 * record.by_pose)
+        common = median(witnesses) if witnesses else 0.0
+        off = min(abs(record.mean), abs(record.mean - common)) / sqrt(
+            (ALLOWED * sigma) ** 2 + DOUBT**2 * record.by_pose
+        )
         if record.agrees_since_ns is not None:
             self._try(record, off, stamp_ns)
         elif off > 1.0 and witnesses and self._left_out() < self._most:

@@ -21,7 +21,7 @@ from estimators.messages import (
     Scan,
     measurement_stamp_ns,
 )
-from tests.strategies import HOUR_NS, SETUP, hostile_streams, range_frame
+from tests.strategies import AGE_NS, HOUR_NS, SETUP, hostile_streams, range_frame
 
 EVERY_ESTIMATOR = pytest.mark.parametrize("name", sorted(ESTIMATORS))
 LONG = settings(deadline=None, max_examples=50)
@@ -121,7 +121,10 @@ def assert_is_covariance(cov: FloatArray) -> None:
 
 @EVERY_ESTIMATOR
 @LONG
-@given(stream=hostile_streams(), ahead=st.sampled_from([0, 1, 33_000_000, SECOND_NS, -33_000_000, HOUR_NS]))
+@given(
+    stream=hostile_streams(),
+    ahead=st.sampled_from([0, 1, 33_000_000, SECOND_NS, -33_000_000, HOUR_NS, -AGE_NS, AGE_NS]),
+)
 def test_hostile_streams_get_verdicts_and_sound_poses(
     name: str, stream: list[Measurement], ahead: int
 ) -> None:
