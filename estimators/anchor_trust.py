@@ -1,4 +1,4 @@
-"""Anchors whose ranges contradict the others': moved, surveyed wrongly or misread, and left out for a while."""
+"""Anchors whose ranges contradict those of the others: moved or surveyed wrongly; left out for a while."""
 
 from dataclasses import dataclass
 from math import sqrt

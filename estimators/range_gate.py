@@ -77,8 +77,8 @@ class RangeGate:
     """Height reduction of known anchors' ranges, NIS gate, and rejection of blocked ranges.
 
     A range is rejected when it is too far from its prediction (NIS gate), or more likely blocked than not by
-    the sum of what the chosen methods say, see `estimators.nlos`; and while its anchor contradicts the others,
-    see `AnchorTrust`.
+    the sum of what the chosen methods say, see `estimators.nlos`; and while its anchor contradicts the
+    others, see `AnchorTrust`.
     """
 
     class Config(BaseModel):

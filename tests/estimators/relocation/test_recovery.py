@@ -157,6 +157,27 @@ def test_blocked_anchors_never_move_a_filter_that_rightly_refuses_them(name: str
         assert is_right(estimator, robot)
 
 
+def displaced(since: float, anchor_id: int, _: np.random.Generator) -> float:
+    """All ranges of one anchor are too short from some time on."""
+    return -0.6 if since > 8.0 and anchor_id == 2 else 0.0
+
+
+@pytest.mark.parametrize("name", FILTERS)
+def test_a_displaced_anchor_is_left_out_and_no_other_and_draws_the_pose_nowhere(name: str) -> None:
+    robot = Robot(ROOM, 5, displaced)
+    estimator = recovering(name, known_start(ROOM, robot.pose))
+    feed(estimator, robot.walk(8.0))
+    for _ in range(6):
+        reports = feed(estimator, robot.walk(2.0))
+        assert np.hypot(*error_of(estimator, robot)[:2]) < 0.1
+    verdicts = [report.verdicts for report in reports if len(report.verdicts) == len(ROOM.anchors)]
+    contradicting = list(ROOM.anchors).index(2)
+    assert {each[contradicting] for each in verdicts} == {Verdict.CONTRADICTS}
+    others = [verdict for each in verdicts for i, verdict in enumerate(each) if i != contradicting]
+    assert others.count(Verdict.ACCEPTED) > 0.9 * len(others)
+    assert reset_counter(estimator, robot) == 0
+
+
 @pytest.mark.parametrize(
     "placement", [np.array([0.0, 0.0, 1.2]), np.array([2.0, -1.0, 0.0]), np.array([-1.5, 1.5, 3.0])]
 )
