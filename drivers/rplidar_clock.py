@@ -16,6 +16,7 @@ _MS = 1_000_000
 _ENDLESS = 1 << 62  # samples are counted without wrapping
 _LATE_NS = 30 * _MS  # more than a host's usual jitter ...
 _LATE_FOR_NS = 300 * _MS  # ... for longer than its stalls
+_LONGEST_DELAY_NS = 500 * _MS  # more is not held back anywhere for long: it was lost
 _UNEVEN = 0.02  # the head turns more evenly than this from one revolution to the next
 _RATE_WINDOW_NS = 1500 * _MS
 _MAX_RATE_ERROR = 0.05  # `DeviceClock` learns smaller ones; a stall of 150 ms looks like this
@@ -88,9 +89,11 @@ class SampleClock:
             self._is_uneven = False
         elif self._late_since_ns is None:
             self._late_since_ns = arrival_ns
-        elif self._is_uneven and arrival_ns - self._late_since_ns > _LATE_FOR_NS:
-            self._late_since_ns = None
-            return True
+        elif arrival_ns - self._late_since_ns > _LATE_FOR_NS:
+            is_lost = self._is_uneven or arrival_ns - newest_ns > _LONGEST_DELAY_NS
+            if is_lost:
+                self._late_since_ns = None
+            return is_lost
         return False
 
     def _check_rate(self, count: int, arrival_ns: int) -> None:

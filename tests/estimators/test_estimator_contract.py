@@ -181,6 +181,12 @@ def test_no_pose_before_the_first_measurement(name: str) -> None:
 
 
 @EVERY_ESTIMATOR
+@pytest.mark.parametrize("away_ns", [AGE_NS, -AGE_NS])
+def test_nothing_is_said_of_a_pose_years_away(name: str, away_ns: int) -> None:
+    assert started(name).pose_at(2 * SECOND_NS + away_ns) is None
+
+
+@EVERY_ESTIMATOR
 def test_honest_stream_gives_the_true_pose(name: str) -> None:
     pose = started(name).pose_at(2 * SECOND_NS)
     assert pose is not None
