@@ -53,6 +53,9 @@ class AnchorTrust:
     them is known far better than a single one. Without odometry nothing holds the pose, and every anchor is
     believed. What all anchors err by alike is a bias of the tag, and no anchor's fault.
 
+    A pose that was wrong from the start contradicts anchors, too. So none is left out before all have agreed
+    with it for a while.
+
     With n anchors at most (n - 2) / 2 are left out: more cannot be told from a wrong pose. Ranges of an
     anchor that is left out show whether the pose, which owes them nothing, agrees with it again.
 
@@ -71,6 +74,8 @@ class AnchorTrust:
         """Believe every anchor."""
         self._records: dict[int, _Record] = {}
         self._odometry_ns: int | None = None
+        self._agree_since_ns: int | None = None
+        self._have_agreed = False
 
     def note_odometry(self, stamp_ns: int) -> None:
         """Odometry came."""
@@ -94,8 +99,10 @@ class AnchorTrust:
         if not self._most:
             return
         if self._odometry_ns is None or not _is_recent(self._odometry_ns, stamp_ns):
-            self._records.clear()
+            self.reset()
             return
+        if self._agree_since_ns is None:
+            self._agree_since_ns = stamp_ns
         record = self._records.setdefault(anchor_id, _Record())
         record.note(stamp_ns, residual, variance, sigma)
         if record.count < LEAST:
@@ -114,9 +121,12 @@ class AnchorTrust:
         )
         if record.agrees_since_ns is not None:
             self._try(record, off, stamp_ns)
+        elif off > 1.0 and not self._have_agreed:
+            self._agree_since_ns = stamp_ns
         elif off > 1.0 and witnesses and self._left_out() < self._most:
             record.agrees_since_ns = stamp_ns
             record.times += 1
+        self._have_agreed |= stamp_ns - self._agree_since_ns > PROBATION * 1e9
 
     def _left_out(self) -> int:
         return sum(record.agrees_since_ns is not None for record in self._records.values())

@@ -160,14 +160,14 @@ def test_blocked_anchors_never_move_a_filter_that_rightly_refuses_them(name: str
 
 def displaced(since: float, anchor_id: int, _: np.random.Generator) -> float:
     """All ranges of one anchor are too short from some time on."""
-    return -0.6 if since > 8.0 and anchor_id == 2 else 0.0
+    return -0.6 if since > 18.0 and anchor_id == 2 else 0.0
 
 
 @pytest.mark.parametrize("name", FILTERS)
 def test_a_displaced_anchor_is_left_out_and_no_other_and_draws_the_pose_nowhere(name: str) -> None:
     robot = Robot(ROOM, 5, displaced)
     estimator = recovering(name, known_start(ROOM, robot.pose))
-    feed(estimator, robot.walk(8.0))
+    feed(estimator, robot.walk(18.0))
     for _ in range(6):
         reports = feed(estimator, robot.walk(2.0))
         assert np.hypot(*error_of(estimator, robot)[:2]) < 0.1
@@ -192,7 +192,7 @@ def test_a_lost_pose_is_not_looked_for_with_ranges_of_a_displaced_anchor(
     monkeypatch.setattr(Window, "add_ranges", spy)
     robot = Robot(ROOM, 5, displaced)
     estimator = recovering("ekf", known_start(ROOM, robot.pose))
-    feed(estimator, robot.walk(16.0))
+    feed(estimator, robot.walk(26.0))
     searched_with.clear()
     feed(estimator, robot.walk(2.0))
     assert set(searched_with) == set(ROOM.anchors) - {2}
