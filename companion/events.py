@@ -138,7 +138,7 @@ class EventFinder:
         for k, i, verdict in known:
             self._take_sign(f"A{i}", frame.stamp_ns)
             residual = float(report.residuals[k]) if len(report.residuals) else np.nan
-            is_refused = verdict.is_nlos or verdict is Verdict.GATED
+            is_refused = verdict.is_nlos or verdict in (Verdict.GATED, Verdict.CONTRADICTS)
             refused += is_refused
             if is_refused:
                 story = self._blocked.setdefault(i, _Refusals(frame.stamp_ns, frame.stamp_ns))

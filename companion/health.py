@@ -176,6 +176,9 @@ class HealthMonitor:
         gated = [i for i, verdict in enumerate(report.verdicts) if verdict is Verdict.GATED]
         # What else speaks for a blocked range says nothing of the pose.
         judged = good + sum(verdict in _DISAGREES for verdict in report.verdicts)
+        contradicting = sum(verdict is Verdict.CONTRADICTS for verdict in report.verdicts)
+        if contradicting > good:  # fewer are the anchors' fault
+            judged += contradicting
         if not judged:
             return
         if good:

@@ -225,14 +225,16 @@ class Rplidar:
             self._clock.restart()
             if self._revolution is not None:
                 self._revolution.spoil()
+        starts = samples.starts.nonzero()[0]
+        self._clock.note_starts(samples.first + starts)
         times_ns = self._sample_times(samples, arrival_ns)
         quality = samples.quality if samples.scan_type in _WITH_QUALITY else np.zeros_like(times_ns)
         part, count = _Part(samples.angle_q14, samples.distance_q2, quality, times_ns), len(times_ns)
         scans: list[Scan] = []
-        starts = samples.starts.nonzero()[0].tolist()
+        begins = starts.tolist()
         if self._revolution is not None:
-            self._revolution.add(part.cut(0, starts[0]) if starts else part)
-        for first, end in pairwise([*starts, count]):
+            self._revolution.add(part.cut(0, begins[0]) if begins else part)
+        for first, end in pairwise([*begins, count]):
             if self._revolution is not None:
                 scan = self._revolution.scan(self._config.min_range, self._config.max_range)
                 if scan is None:

@@ -16,6 +16,8 @@ _MS = 1_000_000
 _ENDLESS = 1 << 62  # samples are counted without wrapping
 _LATE_NS = 30 * _MS  # more than a host's usual jitter ...
 _LATE_FOR_NS = 300 * _MS  # ... for longer than its stalls
+_LONGEST_DELAY_NS = 500 * _MS  # more is not held back anywhere for long: it was lost
+_UNEVEN = 0.02  # the head turns more evenly than this from one revolution to the next
 _RATE_WINDOW_NS = 1500 * _MS
 _MAX_RATE_ERROR = 0.05  # `DeviceClock` learns smaller ones; a stall of 150 ms looks like this
 
@@ -24,7 +26,8 @@ class SampleClock:
     """The count of samples as a clock: the device takes them at an even rate, and their arrivals set it.
 
     Arrivals also show what the count cannot: samples that were lost without a trace, after which all seem
-    late; and a wrong sample duration, assumed or told (answers have no checksum).
+    late; and a wrong sample duration, assumed or told (answers have no checksum). Bytes that are merely late
+    look like lost samples but for the head: it turns evenly, so a revolution with lost samples is too short.
 
     Args:
         sample_ns: time from one sample to the next [ns].
@@ -40,7 +43,22 @@ class SampleClock:
         """Samples were lost: their count has lost its relation to time."""
         self._clock.restart()
         self._late_since_ns: int | None = None
+        self._is_uneven = False  # a revolution was, since arrivals are late
+        self._last_start: int | None = None
+        self._revolution: int | None = None  # samples in the last one
         self._window: tuple[int, int] | None = None  # count and arrival at its beginning
+
+    def note_starts(self, counts: IntArray) -> None:
+        """Take note of where revolutions began.
+
+        Args:
+            counts: (N,) numbers of their first samples, in order, before `times_ns` is asked for these.
+        """
+        for count in counts.tolist():
+            samples = None if self._last_start is None else count - self._last_start
+            if samples is not None and self._revolution is not None:
+                self._is_uneven |= abs(samples - self._revolution) > _UNEVEN * self._revolution
+            self._last_start, self._revolution = count, samples
 
     def times_ns(self, first: int, end: int, newest: int, arrival_ns: int) -> IntArray:
         """Host times of samples.
@@ -65,14 +83,17 @@ class SampleClock:
         return times_ns
 
     def _late_for_good(self, newest_ns: int, arrival_ns: int) -> bool:
-        """Whether arrivals have been late for longer than a host is busy."""
+        """Whether arrivals have been late for longer than a host is busy, and samples seem to be missing."""
         if arrival_ns - newest_ns <= _LATE_NS:
             self._late_since_ns = None
+            self._is_uneven = False
         elif self._late_since_ns is None:
             self._late_since_ns = arrival_ns
         elif arrival_ns - self._late_since_ns > _LATE_FOR_NS:
-            self._late_since_ns = None
-            return True
+            is_lost = self._is_uneven or arrival_ns - newest_ns > _LONGEST_DELAY_NS
+            if is_lost:
+                self._late_since_ns = None
+            return is_lost
         return False
 
     def _check_rate(self, count: int, arrival_ns: int) -> None:

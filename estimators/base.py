@@ -17,6 +17,8 @@ class Verdict(StrEnum):
     ACCEPTED = "accepted"
     GATED = "gated"
     """Too far from the prediction (NIS above the gate)."""
+    CONTRADICTS = "contradicts"
+    """Its anchor's ranges have erred on average while those of others agreed: it may have been moved."""
     SUSPECT = "suspect"
     """Near the prediction, but its anchor was blocked a moment ago and probably still is."""
     TOO_LONG = "NLOS: longer than predicted"

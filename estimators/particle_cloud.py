@@ -101,7 +101,7 @@ class ParticleCloud(FixTaker):
 
     def pose_at(self, stamp_ns: int) -> PoseEstimate | None:
         """Mean and covariance, predicted with constant velocity; None before the first measurement."""
-        if self._stamp_ns is None:
+        if self._stamp_ns is None or not self._reaches(stamp_ns):
             return None
         mean, cov = self._cloud.moments(self._particles, self._weights, 6)
         dt = 0.0 if self._stands else (stamp_ns - self._stamp_ns) * 1e-9

@@ -8,8 +8,9 @@ from typing import Literal, TypeAlias
 from pydantic import BaseModel, ConfigDict, Field
 
 from estimators import chi2
+from estimators.anchor_trust import AnchorTrust
 from estimators.base import Setup, Verdict
-from estimators.messages import FloatArray, Measurement, PoseEstimate, RangeFrame
+from estimators.messages import FloatArray, Measurement, PoseEstimate, PoseIncrement, RangeFrame
 from estimators.models.range import reduce_height
 from estimators.nlos.power import Power
 from estimators.nlos.prediction import PRIOR, Prediction, excess_log_ratio
@@ -81,7 +82,8 @@ class RangeGate:
     """Height reduction of known anchors' ranges, NIS gate, and rejection of blocked ranges.
 
     A range is rejected when it is too far from its prediction (NIS gate), or more likely blocked than not by
-    the sum of what the chosen methods say, see `estimators.nlos`.
+    the sum of what the chosen methods say, see `estimators.nlos`; and while its anchor contradicts the
+    others, see `AnchorTrust`.
     """
 
     class Config(BaseModel):
@@ -130,9 +132,11 @@ class RangeGate:
         self._prediction = Prediction(config.nlos_memory) if "prediction" in methods else None
         self._power = Power(config.nlos_power) if "power" in methods else None
         self._visibility = Visibility(config.obstacle_height, setup) if "visibility" in methods else None
+        self._trust = AnchorTrust(len(setup.anchors))
 
     def reset(self) -> None:
         """Know nothing of any anchor and of what stands around."""
+        self._trust.reset()
         if self._prediction is not None:
             self._prediction.reset()
         if self._visibility is not None:
@@ -145,6 +149,8 @@ class RangeGate:
 
     def see(self, measurement: Measurement, pose_at: Callable[[int], PoseEstimate | None]) -> None:
         """Look at what is no range; `pose_at` is that of the filter, which has taken the measurement."""
+        if isinstance(measurement, PoseIncrement):
+            self._trust.note_odometry(measurement.stamp_ns)
         if self._visibility is not None:
             self._visibility.see(measurement, pose_at)
 
@@ -172,6 +178,17 @@ class RangeGate:
             residual: measured minus predicted [m], before the range is used.
             nis: normalised innovation squared, likewise.
         """
+        verdict, factor = self._judge(candidate, residual, nis)
+        if verdict.is_nlos:
+            return verdict, factor
+        variance = residual**2 / nis if nis > 0.0 else candidate.sigma**2
+        self._trust.note(candidate.anchor_id, candidate.stamp_ns, residual, variance, candidate.sigma)
+        if not self._trust.believes(candidate.anchor_id):
+            return Verdict.CONTRADICTS, 1.0
+        return verdict, factor
+
+    def _judge(self, candidate: Candidate, residual: float, nis: float) -> tuple[Verdict, float]:
+        """Verdict on the range alone."""
         if nis > self._limit and residual < 0.0:
             # Nothing shortens a range: rather is the pose wrong, which says nothing of what stands between.
             return Verdict.GATED, 1.0

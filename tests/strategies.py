@@ -34,6 +34,8 @@ SETUP = Setup(
 """A room of 8 m by 6 m with an anchor in every corner and a tag off the body's origin."""
 
 HOUR_NS = 3_600 * 10**9
+AGE_NS = 10**18
+"""31 years: as far off as a wrong clock says."""
 
 coordinates = st.floats(-50.0, 50.0)
 tiny = st.floats(-1e-9, 1e-9)

@@ -313,7 +313,7 @@ def library(config: Config) -> list[str]:
         ]
     for name in lidar:
         faults += [
-            f"silent:sensor={name},at=15,for=0.3",
+            f"silent:sensor={name},at=15,for=0.25",
             f"silent:sensor={name},at=15,for=5",
             f"late:sensor={name},by=0.2,at=15,for=5",
             "blocked:at=15,for=10",

@@ -108,7 +108,7 @@ class GraphSmoother(KeyframeTracker):
 
         The variance of yaw is infinite once the heading was lost, until reset, as in `ekf`.
         """
-        if self._stamp_ns is None:
+        if self._stamp_ns is None or not self._reaches(stamp_ns):
             return None
         mean, cov = self._predicted(stamp_ns)
         return self._estimate(stamp_ns, mean[STATE], cov[STATE, STATE], self._heading_known)

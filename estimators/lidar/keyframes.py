@@ -11,6 +11,8 @@ from estimators.geometry import lift
 from estimators.messages import FloatArray, Measurement, PoseEstimate, PoseIncrement, RangeFrame
 from estimators.models.motion_settings import WhiteAcceleration
 
+FURTHEST_NS = 600_000_000_000
+"""Further than this from the newest measurement nothing is said of the pose: it may be kilometres away."""
 START_SPEED_SIGMA = 0.3
 """Standard deviation of each velocity when the robot sets off [m/s, rad/s]."""
 
@@ -66,6 +68,8 @@ class KeyframeTracker(ABC):
                 return Report((Verdict.LATE,))
             report = self._update_increment(measurement)
             if measurement.is_keyframe:
+                if report.verdicts != (Verdict.ACCEPTED,):
+                    self._begin_anew()  # the new reference is tied to no earlier one
                 self._take_reference()
                 self._reference_stamp_ns = measurement.stamp_ns
             return report
@@ -74,7 +78,7 @@ class KeyframeTracker(ABC):
 
     @abstractmethod
     def pose_at(self, stamp_ns: int) -> PoseEstimate | None:
-        """Pose at an instant; None before the first measurement."""
+        """Pose at an instant; None before the first measurement or further than `FURTHEST_NS` away."""
 
     @abstractmethod
     def _place(self, pose: FloatArray, cov: FloatArray) -> None:
@@ -131,6 +135,10 @@ class KeyframeTracker(ABC):
             velocity=np.array([state[3], state[4], 0.0]),
             velocity_cov=velocity_cov,
         )
+
+    def _reaches(self, stamp_ns: int) -> bool:
+        """Whether anything is said of the pose at a time."""
+        return self._stamp_ns is not None and abs(stamp_ns - self._stamp_ns) <= FURTHEST_NS
 
     def _is_late(self, stamp_ns: int) -> bool:
         return self._stamp_ns is not None and stamp_ns < self._stamp_ns

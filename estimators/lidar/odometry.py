@@ -48,7 +48,7 @@ class LidarOdometry(KeyframeTracker):
 
         The variance of yaw is infinite once the heading was lost (see `MAX_HEADING_SIGMA`), until reset.
         """
-        if self._stamp_ns is None:
+        if self._stamp_ns is None or not self._reaches(stamp_ns):
             return None
         F, Q = self._motion(0.0 if self._stands else (stamp_ns - self._stamp_ns) * 1e-9)
         cov = F @ self._filter.P[MOVING, MOVING] @ F.T + Q

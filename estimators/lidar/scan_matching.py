@@ -223,10 +223,12 @@ class ScanMatcher:
         fit = keyframe.settle(found, basis, prior, predicted, start, sigma, spread)
         if fit is None:
             return None
-        # A bare wall looks the same everywhere: after a long gap it is only known to be one when all fits.
-        wandered = float(np.sqrt(Q[0, 0]))
-        is_another = wandered > config.max_correspondence and np.linalg.matrix_rank(fit.held, tol=0.5) < 3
-        if fit.share < config.min_inlier_share or is_another:
+        # A bare wall looks the same everywhere, and half of a room like half of it turned round: after a long
+        # gap it is only known to be the one when all fits.
+        has_wandered = float(np.sqrt(Q[0, 0])) > config.max_correspondence
+        least_share = max(config.min_inlier_share, KEYFRAME_SHARE * has_wandered)
+        is_another = has_wandered and np.linalg.matrix_rank(fit.held, tol=0.5) < 3
+        if fit.share < least_share or is_another:
             return None
 
         states = fit.states

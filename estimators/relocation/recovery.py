@@ -111,15 +111,16 @@ class Recovering:
 
     def update(self, measurement: Measurement) -> Report:
         """Take one measurement; while the pose is looked for, the report's note says what is missing."""
+        known = self._wrapped.update(measurement) if self._known else None
         if isinstance(measurement, RangeFrame):
-            verdicts = self._window.add_ranges(measurement)
+            verdicts = self._window.add_ranges(_not_blamed(measurement, known))
         elif isinstance(measurement, PoseIncrement):
             verdicts = [self._window.add_increment(measurement)]
         else:
             verdicts = [Verdict.NOT_USED]
         if self._map is not None:
             _show(self._map, measurement, verdicts)
-        report = self._wrapped.update(measurement) if self._known else Report(tuple(verdicts))
+        report = known or Report(tuple(verdicts))
         if isinstance(measurement, PoseIncrement) and verdicts == [Verdict.WAITING]:
             self._look_round(measurement.stamp_ns)
         return replace(report, note=self._note) if self._note else report
@@ -274,6 +275,17 @@ def _is_better(
     """
     loss, other = total_loss(placed, np.array([found, held])).tolist()
     return _is_clearly_less(loss, other) and lies_outside(found, held, found_cov + held_cov, OUTSIDE)
+
+
+def _not_blamed(frame: RangeFrame, report: Report | None) -> RangeFrame:
+    """A frame without ranges of anchors that the filter leaves out, while others agree with it."""
+    if report is None or Verdict.CONTRADICTS not in report.verdicts:
+        return frame
+    kept = np.array([verdict is not Verdict.CONTRADICTS for verdict in report.verdicts])
+    if report.verdicts.count(Verdict.ACCEPTED) < len(kept) - np.count_nonzero(kept):
+        return frame
+    columns = (frame.anchor_ids, frame.ranges, frame.rx_power, frame.fp_power)
+    return RangeFrame(frame.stamp_ns, frame.tag_id, *(column[kept] for column in columns))
 
 
 def _show(in_map: MapSearch, measurement: Measurement, verdicts: list[Verdict]) -> None:

@@ -13,6 +13,7 @@ from pydantic import Field
 
 from estimators.base import Report, Setup, Verdict
 from estimators.geometry import lift, rotation, wrap_angle
+from estimators.lidar.keyframes import FURTHEST_NS
 from estimators.messages import (
     Attitude,
     FloatArray,
@@ -123,7 +124,7 @@ class UwbImuEkf:
         The variance of yaw is infinite while there is no attitude or no start heading; then the body is
         taken to be at the tag.
         """
-        if not self._is_placed or self._stamp_ns is None:
+        if not self._is_placed or self._stamp_ns is None or abs(stamp_ns - self._stamp_ns) > FURTHEST_NS:
             return None
         dt = (stamp_ns - self._stamp_ns) * 1e-9
         F, Q = constant_acceleration(dt, self._config.jerk_noise)

@@ -223,6 +223,18 @@ def test_what_is_too_long_speaks_against_the_pose_and_what_only_stands_in_the_wa
     assert state(monitor, 25.0, pose()) is expected
 
 
+@pytest.mark.parametrize(("contradicting", "expected"), [(1, State.OK), (2, State.OK), (3, State.LOST)])
+def test_anchors_that_contradict_speak_against_the_pose_when_they_outnumber_the_others(
+    contradicting: int, expected: State
+) -> None:
+    monitor = monitor_at(5.0)
+    verdicts = (Verdict.CONTRADICTS,) * contradicting + (Verdict.ACCEPTED,) * (4 - contradicting)
+    for stamp_ns in range(5 * SECOND, 15 * SECOND, SECOND // 10):
+        monitor.observe(ranges(stamp_ns), Report(verdicts, np.full(4, -0.5), np.zeros(4)))
+        monitor.observe(increment(stamp_ns), Report((Verdict.ACCEPTED,)))
+    assert state(monitor, 15.0, pose()) is expected
+
+
 def test_the_operator_hears_which_anchors_are_used_and_why_the_others_are_not() -> None:
     monitor = HealthMonitor(HealthTable.model_validate({}), True, True, anchor_ids=[0, 1, 2, 3, 7])
     assert uwb_line(monitor.anchors(0)) == "UWB: 0 of 5 anchors, A0 A1 A2 A3 A7 silent"

@@ -324,7 +324,7 @@ def test_the_library_has_a_fault_of_every_kind_and_all_of_them_are_valid(config:
     texts = library(config)
     assert {text.partition(":")[0] for text in texts} == set(KINDS)
     for text in texts:
-        assert parse_fault(text, config).active(16.0) or "for=0.3" in text
+        assert parse_fault(text, config).active(16.0) or "for=0.25" in text
 
 
 def test_every_fault_of_the_library_is_survived(log: Log, records: list[Record], tmp_path: Path) -> None:

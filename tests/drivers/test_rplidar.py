@@ -266,6 +266,16 @@ def test_packets_that_are_late_now_and_then_do_not_move_the_times() -> None:
     assert worst_error_ms(scans, source, T0_NS, delay_ns=0) < 0.01
 
 
+@every_kind
+def test_bytes_that_are_late_for_seconds_do_not_move_the_times(kind: AnswerType) -> None:
+    source = stream(kind, 10.0)
+    data, arrivals = source.line()
+    is_late = (arrivals > T0_NS + 5500 * MS) & (arrivals < T0_NS + 9500 * MS)
+    arrivals = np.maximum.accumulate(arrivals + np.where(is_late, 200 * MS, 0))
+    scans = decoded(read_by_a_busy_host(data, arrivals, LEAST_DELAY_NS, 11))
+    assert worst_error_ms(scans, source, T0_NS + 5 * SECOND) < 1.0
+
+
 def test_a_pause_of_the_device_is_over_in_some_seconds() -> None:
     source = stream(EXPRESS, 12.0)
     data, arrivals = source.line()

@@ -199,6 +199,17 @@ def test_a_keyframe_founds_the_reference_whatever_became_of_its_increment(
     np.testing.assert_allclose(true_increment(mean[6:], mean[:3]), step, atol=1e-3)
 
 
+@pytest.mark.parametrize(("jump", "is_known"), [(5.0, False), (0.0, True)])
+def test_a_heading_that_only_a_refused_keyframe_held_is_not_known(jump: float, is_known: bool) -> None:
+    ekf = standing()
+    ekf.update(PoseIncrement(0, NOW_NS + 10**8, np.zeros(3), TIGHT, is_keyframe=False))
+    after_gap_ns = NOW_NS + 3 * 10**9  # by then the heading is anybody's guess
+    ekf.update(PoseIncrement(0, after_gap_ns, np.array([60.0 * jump, 0.0, 0.0]), TIGHT, is_keyframe=True))
+    pose = ekf.pose_at(after_gap_ns)
+    assert pose is not None
+    assert np.isfinite(pose.cov[5, 5]) == is_known
+
+
 def test_a_late_keyframe_founds_nothing() -> None:
     ekf = standing()
     late = NOW_NS - 50_000_000

@@ -24,7 +24,7 @@ from estimators.messages import (
     measurement_stamp_ns,
 )
 from estimators.relocation.recovery import Recovering
-from tests.strategies import HOUR_NS, SETUP, hostile_streams, range_frame
+from tests.strategies import AGE_NS, HOUR_NS, SETUP, hostile_streams, range_frame
 
 EVERY_ESTIMATOR = pytest.mark.parametrize("name", sorted(ESTIMATORS))
 LONG = settings(deadline=None, max_examples=50)
@@ -124,7 +124,10 @@ def assert_is_covariance(cov: FloatArray) -> None:
 
 @EVERY_ESTIMATOR
 @LONG
-@given(stream=hostile_streams(), ahead=st.sampled_from([0, 1, 33_000_000, SECOND_NS, -33_000_000, HOUR_NS]))
+@given(
+    stream=hostile_streams(),
+    ahead=st.sampled_from([0, 1, 33_000_000, SECOND_NS, -33_000_000, HOUR_NS, -AGE_NS, AGE_NS]),
+)
 def test_hostile_streams_get_verdicts_and_sound_poses(
     name: str, stream: list[Measurement], ahead: int
 ) -> None:
@@ -178,6 +181,12 @@ def test_asking_for_poses_changes_nothing(name: str, stream: list[Measurement], 
 @EVERY_ESTIMATOR
 def test_no_pose_before_the_first_measurement(name: str) -> None:
     assert make(name).pose_at(0) is None
+
+
+@EVERY_ESTIMATOR
+@pytest.mark.parametrize("away_ns", [AGE_NS, -AGE_NS])
+def test_nothing_is_said_of_a_pose_years_away(name: str, away_ns: int) -> None:
+    assert started(name).pose_at(2 * SECOND_NS + away_ns) is None
 
 
 @EVERY_ESTIMATOR

@@ -11,6 +11,7 @@ from estimators import estimator_config_class, make_estimator
 from estimators.base import Estimator, Report, Setup, Verdict
 from estimators.messages import FloatArray, Measurement, PoseEstimate, RangeFrame
 from estimators.relocation.recovery import Recovering
+from estimators.relocation.window import Window
 from tests.estimators.matched_world import pose_error
 from tests.estimators.relocation.wandering_robot import (
     ROOM,
@@ -155,6 +156,46 @@ def test_blocked_anchors_never_move_a_filter_that_rightly_refuses_them(name: str
             assert reset_counter(estimator, robot) == 0
         assert refused > 50
         assert is_right(estimator, robot)
+
+
+def displaced(since: float, anchor_id: int, _: np.random.Generator) -> float:
+    """All ranges of one anchor are too short from some time on."""
+    return -0.6 if since > 18.0 and anchor_id == 2 else 0.0
+
+
+@pytest.mark.parametrize("name", FILTERS)
+def test_a_displaced_anchor_is_left_out_and_no_other_and_draws_the_pose_nowhere(name: str) -> None:
+    robot = Robot(ROOM, 5, displaced)
+    estimator = recovering(name, known_start(ROOM, robot.pose))
+    feed(estimator, robot.walk(18.0))
+    for _ in range(6):
+        reports = feed(estimator, robot.walk(2.0))
+        assert np.hypot(*error_of(estimator, robot)[:2]) < 0.1
+    verdicts = [report.verdicts for report in reports if len(report.verdicts) == len(ROOM.anchors)]
+    contradicting = list(ROOM.anchors).index(2)
+    assert {each[contradicting] for each in verdicts} == {Verdict.CONTRADICTS}
+    others = [verdict for each in verdicts for i, verdict in enumerate(each) if i != contradicting]
+    assert others.count(Verdict.ACCEPTED) > 0.9 * len(others)
+    assert reset_counter(estimator, robot) == 0
+
+
+def test_a_lost_pose_is_not_looked_for_with_ranges_of_a_displaced_anchor(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    searched_with: list[int] = []
+    add_ranges = Window.add_ranges
+
+    def spy(window: Window, frame: RangeFrame) -> list[Verdict]:
+        searched_with.extend(frame.anchor_ids.tolist())
+        return add_ranges(window, frame)
+
+    monkeypatch.setattr(Window, "add_ranges", spy)
+    robot = Robot(ROOM, 5, displaced)
+    estimator = recovering("ekf", known_start(ROOM, robot.pose))
+    feed(estimator, robot.walk(26.0))
+    searched_with.clear()
+    feed(estimator, robot.walk(2.0))
+    assert set(searched_with) == set(ROOM.anchors) - {2}
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,121 @@
+"""Anchors that contradict the others: left out, tried, believed again."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from estimators.anchor_trust import ALLOWED, PROBATION, AnchorTrust
+
+SIGMA = 0.1
+STEP_NS = 40_000_000
+VARIANCE = SIGMA**2 + 0.01**2
+
+
+def hear(
+    trust: AnchorTrust,
+    begin: float,
+    end: float,
+    means: dict[int, float],
+    noise: float = SIGMA,
+    odometry: bool = True,
+) -> list[set[int]]:
+    """Anchors heard at 25 Hz whose residuals err by so much; who was left out after each frame."""
+    rng = np.random.default_rng(7)
+    left_out = []
+    for stamp_ns in range(round(begin * 1e9), round(end * 1e9), STEP_NS):
+        if odometry:
+            trust.note_odometry(stamp_ns)
+        for anchor_id, mean in means.items():
+            trust.note(anchor_id, stamp_ns, mean + noise * rng.standard_normal(), VARIANCE, SIGMA)
+        left_out.append({i for i in means if not trust.believes(i)})
+    return left_out
+
+
+def agreeing(**other: float) -> dict[int, float]:
+    return {0: 0.0, 1: 0.0, 2: 0.0, 3: 0.0} | {int(name[1:]): mean for name, mean in other.items()}
+
+
+@pytest.mark.parametrize("shift", [-0.5, -0.15, 0.15, 0.5])
+def test_an_anchor_that_errs_on_average_is_left_out_within_two_seconds_and_no_other(shift: float) -> None:
+    trust = AnchorTrust(4)
+    hear(trust, 0.0, 15.0, agreeing())
+    left_out = hear(trust, 15.0, 17.0, agreeing(a2=shift))
+    assert left_out[-1] == {2}
+    assert set().union(*left_out) == {2}
+
+
+def test_noise_alone_leaves_out_no_anchor_in_ten_minutes() -> None:
+    assert not any(hear(AnchorTrust(4), 0.0, 600.0, agreeing()))
+
+
+def test_single_outliers_leave_out_no_anchor() -> None:
+    trust = AnchorTrust(4)
+    rng = np.random.default_rng(3)
+    for k in range(5000):
+        trust.note_odometry(k * STEP_NS)
+        for anchor_id in range(4):
+            spike = -3.0 if rng.random() < 0.05 else 0.0
+            trust.note(anchor_id, k * STEP_NS, spike + SIGMA * rng.standard_normal(), VARIANCE, SIGMA)
+            assert trust.believes(anchor_id)
+
+
+def test_what_all_anchors_err_by_alike_is_no_anchors_fault() -> None:
+    assert not any(hear(AnchorTrust(4), 0.0, 30.0, dict.fromkeys(range(4), 0.3)))
+
+
+def test_without_odometry_every_anchor_is_believed() -> None:
+    trust = AnchorTrust(4)
+    hear(trust, 0.0, 15.0, agreeing())
+    assert not any(hear(trust, 18.0, 28.0, agreeing(a1=0.5), odometry=False))
+
+
+def test_an_anchor_alone_is_not_to_blame() -> None:
+    trust = AnchorTrust(4)
+    hear(trust, 0.0, 15.0, agreeing())
+    assert not any(hear(trust, 18.0, 28.0, {1: -0.5}))
+
+
+def test_a_pose_that_was_wrong_from_the_start_is_no_anchors_fault() -> None:
+    assert not any(hear(AnchorTrust(4), 0.0, 30.0, agreeing(a2=0.5)))
+
+
+def test_with_three_anchors_none_is_left_out() -> None:
+    trust = AnchorTrust(3)
+    hear(trust, 0.0, 15.0, dict.fromkeys(range(3), 0.0))
+    assert not any(hear(trust, 15.0, 25.0, {0: 0.0, 1: 0.0, 2: -0.5}))
+
+
+def test_an_anchor_that_agrees_again_is_believed_after_its_probation_which_doubles() -> None:
+    trust, now = AnchorTrust(4), 15.0
+    hear(trust, 0.0, now, agreeing())
+    for probation in (PROBATION, 2.0 * PROBATION):
+        assert hear(trust, now, now + 3.0, agreeing(a1=0.3))[-1] == {1}
+        now += 3.0
+        still = hear(trust, now, now + 0.9 * probation, agreeing(), noise=0.02)
+        assert still[-1] == {1}
+        now += 0.9 * probation
+        assert hear(trust, now, now + 0.1 * probation + 5.0, agreeing(), noise=0.02)[-1] == set()
+        now += 0.1 * probation + 5.0
+
+
+def test_a_reset_believes_every_anchor() -> None:
+    trust = AnchorTrust(4)
+    hear(trust, 0.0, 15.0, agreeing())
+    hear(trust, 15.0, 18.0, agreeing(a0=0.5))
+    assert not trust.believes(0)
+    trust.reset()
+    assert trust.believes(0)
+
+
+@settings(deadline=None, max_examples=40)
+@given(st.lists(st.floats(-1.0, 1.0), min_size=3, max_size=8))
+def test_never_more_are_left_out_than_a_majority_can_tell(means: list[float]) -> None:
+    trust = AnchorTrust(len(means))
+    hear(trust, 0.0, 13.0, dict.fromkeys(range(len(means)), 0.0))
+    left_out = hear(trust, 13.0, 18.0, dict(enumerate(means)))
+    assert max(len(each) for each in left_out) <= (len(means) - 2) // 2
+
+
+def test_less_than_is_allowed_leaves_out_no_anchor() -> None:
+    assert not any(hear(AnchorTrust(4), 0.0, 30.0, agreeing(a3=0.9 * ALLOWED * SIGMA), noise=0.0))
