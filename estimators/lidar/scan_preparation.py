@@ -3,9 +3,10 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from estimators.geometry import transform
+from estimators.geometry import transform, wrap_angles
 from estimators.messages import Attitude, FloatArray, Measurement, Scan
 
 LEAST_GAP_NS = 1_000_000
@@ -47,6 +48,13 @@ class ScanPreparation:
             le=100_000,
             description="of a scan with more returns every second (third, ...) is left",
         )
+        spacing: float = Field(
+            0.02,
+            ge=0,
+            le=1,
+            description="between beams where they end, at least [m]: else what is near, as a hand before the "
+            "scanner, outweighs the room; for scan matching",
+        )
         level: bool = Field(
             False,
             description="bring points to the horizontal by the attitude that a sensor on the body measures",
@@ -82,6 +90,7 @@ class ScanPreparation:
             good = (scan.ranges > 0.0) & (scan.ranges >= config.min_range) & (scan.ranges <= config.max_range)
         good &= np.isfinite(scan.angles)
         kept = np.flatnonzero(good)
+        kept = kept[_spread(scan.angles[kept], scan.ranges[kept], config.spacing)]
         kept = kept[:: -(-len(kept) // config.max_points) or 1]
         angles, ranges, stamp_ns = scan.angles[kept], scan.ranges[kept], scan.end_stamp_ns
         in_lidar = np.column_stack([ranges * np.cos(angles), ranges * np.sin(angles)])
@@ -94,6 +103,15 @@ class ScanPreparation:
                 near = np.abs(level[:, 2]) <= config.max_rise
                 points, times = np.ascontiguousarray(level[near, :2]), times[near]
         return PreparedScan(stamp_ns, points, times)
+
+
+def _spread(angles: FloatArray, ranges: FloatArray, spacing: float) -> NDArray[np.bool_]:
+    """Which of N beams to keep, so that where they end there is at least about so much between them [m]."""
+    if spacing == 0.0:
+        return np.ones(len(angles), dtype=np.bool_)
+    # Square to the beams: the noise of ranges is none.
+    way = np.cumsum(np.abs(wrap_angles(np.diff(angles, prepend=angles[:1]))) * ranges)
+    return np.diff(np.floor(way / spacing), prepend=-1.0) > 0.0
 
 
 def _tilt(quat_wxyz: FloatArray) -> FloatArray:

@@ -1,6 +1,6 @@
 """Scanners of many kinds from settings alone: field of view, rate and range."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -26,6 +26,7 @@ class Scanner:
     """How long a turn of the beam takes [s], where it waits for the next."""
 
 
+RPLIDAR = Scanner(800, 2 * np.pi, 10.0, 12.0, 0.015)
 RPLIDAR_SHORT = Scanner(400, 2 * np.pi, 8.0, 4.0, 0.015)
 SICK_180 = Scanner(361, np.pi, 12.0, 30.0, 0.015)
 SICK_270 = Scanner(811, 1.5 * np.pi, 15.0, 25.0, 0.015)
@@ -114,3 +115,23 @@ def test_modes_of_a_clamped_bar_have_the_variance_of_motion_between_known_ends()
     shares = np.linspace(0.0, 1.0, 41)
     variance = (clamped_bar(shares) ** 2).sum(axis=0)
     np.testing.assert_allclose(variance, (shares * (1.0 - shares)) ** 3 / 3.0, atol=0.03 / 192.0)
+
+
+def test_a_screen_that_moves_along_does_not_hold_the_robot() -> None:
+    # A third of the beams end on a thing 0.3 m before the scanner: there it never moves.
+    here, path, rng = world(1.0), Loop(0.5), np.random.default_rng(1)
+    matcher = ScanMatcher(ScanMatcher.Config(), np.zeros(3))
+    pose, keyframe = np.zeros(3), np.zeros(3)
+    first_ns = last_ns = 0
+    for k in range(100):
+        scan = scan_by(RPLIDAR, here, path, k / RPLIDAR.rate, rng)
+        if k >= 20:
+            scan = replace(scan, ranges=np.where(np.abs(scan.angles) < np.pi / 3, 0.3, scan.ranges))
+        found = matcher.update(scan)
+        assert found is not None
+        first_ns = first_ns or found.stamp_ns
+        pose, last_ns = compose(keyframe, found.increment), found.stamp_ns
+        keyframe = pose if found.is_keyframe else keyframe
+    drift = pose - true_increment(path, first_ns, last_ns)
+    assert matcher.refused == 0
+    assert np.hypot(drift[0], drift[1]) < 0.1
