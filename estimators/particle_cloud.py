@@ -156,8 +156,8 @@ class ParticleCloud(FixTaker):
         verdicts = [Verdict.ACCEPTED] * count
         innovations, nis = np.full(count, np.nan), np.full(count, np.nan)
         candidates: dict[int, Candidate] = {}
-        pose, _ = self._cloud.moments(self._particles, self._weights, 3)
-        for i, item in enumerate(self._gate.candidates(frame, pose)):
+        pose, spread = self._cloud.moments(self._particles, self._weights, 3)
+        for i, item in enumerate(self._gate.candidates(frame, pose, spread[2, 2])):
             if isinstance(item, Verdict):
                 verdicts[i] = item
             else:

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from math import sqrt
 from typing import Literal
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from estimators import chi2
@@ -15,6 +16,8 @@ from estimators.nlos.power import Power
 from estimators.nlos.prediction import PRIOR, Prediction, excess_log_ratio
 from estimators.nlos.robust import sigma_factor
 from estimators.nlos.visibility import Visibility
+
+_NO_BIAS = np.zeros(3)
 
 NlosMethod = Literal["prediction", "power", "visibility", "robust"]
 
@@ -30,6 +33,7 @@ class Candidate:
         measured: horizontal range [m].
         sigma: its standard deviation [m].
         prior: log-odds of its anchor being blocked, by what was known before this frame.
+        bias_by_pose: (3,) derivative of what was taken off for the bearing by (x, y, yaw).
         by_power: log-likelihood ratio of its powers.
         by_visibility: the same of what the LiDAR sees.
     """
@@ -39,6 +43,7 @@ class Candidate:
     anchor: FloatArray
     measured: float
     sigma: float
+    bias_by_pose: FloatArray
     prior: float
     by_power: float
     by_visibility: float
@@ -61,17 +66,39 @@ class HorizontalRanges:
         self._sigma = sigma
         self._anchors = {i: (anchor, setup.height_to(anchor)) for i, anchor in setup.anchors.items()}
         self._lifts = {i: float(arm[2] - setup.tag_in_body[2]) for i, arm in setup.tags.items()}
+        self._arm, self._bearing_biases = setup.arm, setup.bearing_biases
 
-    def of(self, frame: RangeFrame) -> Iterator[Verdict | tuple[FloatArray, float, float]]:
-        """For each range of a frame the anchor (3,), horizontal range and its sigma [m], or what is wrong."""
+    def of(
+        self, frame: RangeFrame, pose: FloatArray | None = None, yaw_variance: float = 0.0
+    ) -> Iterator[Verdict | tuple[FloatArray, float, float, FloatArray]]:
+        """Height reduction of a frame, after the bias by bearing is taken off.
+
+        Args:
+            frame: with N ranges.
+            pose: (3,) predicted x [m], y [m], yaw [rad] of the body in the map; None: that bias stays.
+            yaw_variance: of its yaw [rad^2].
+
+        Yields:
+            For each range the anchor (3,), horizontal range and its sigma [m], and the derivative (3,) of
+            what was taken off by the pose; or what is wrong with it.
+        """
         lift = self._lifts.get(frame.tag_id, 0.0)
+        bias = None if pose is None else self._bearing_biases.get(frame.tag_id)
         for anchor_id, slant in zip(frame.anchor_ids.tolist(), frame.ranges.tolist(), strict=True):
             if anchor_id not in self._anchors:
                 yield Verdict.UNKNOWN_ANCHOR
                 continue
             anchor, height = self._anchors[anchor_id]
+            by_pose = _NO_BIAS
+            if bias is not None and pose is not None:
+                longer, by_pose = bias.at(pose, anchor, self._arm(frame.tag_id), yaw_variance)
+                slant -= longer
             reduced = reduce_height(slant, self._sigma, height - lift)
-            yield Verdict.IMPOSSIBLE if reduced is None else (anchor, *reduced)
+            if reduced is None:
+                yield Verdict.IMPOSSIBLE
+            else:
+                # What is taken off the slant range changes the horizontal one as the noise does.
+                yield anchor, *reduced, by_pose if bias is None else by_pose * (reduced[1] / self._sigma)
 
 
 class RangeGate:
@@ -144,16 +171,19 @@ class RangeGate:
         if self._visibility is not None:
             self._visibility.see(measurement, pose_at)
 
-    def candidates(self, frame: RangeFrame, pose: FloatArray) -> list[Verdict | Candidate]:
+    def candidates(
+        self, frame: RangeFrame, pose: FloatArray, yaw_variance: float
+    ) -> list[Verdict | Candidate]:
         """For each range of a frame what is known before its residual, or what is wrong with it.
 
         Args:
             frame: with N ranges.
             pose: (3,) predicted x [m], y [m], yaw [rad] of the body in the map.
+            yaw_variance: of its yaw [rad^2].
         """
         return [
             item if isinstance(item, Verdict) else self._candidate(frame, i, pose, *item)
-            for i, item in enumerate(self._horizontal.of(frame))
+            for i, item in enumerate(self._horizontal.of(frame, pose, yaw_variance))
         ]
 
     def judge(self, candidate: Candidate, residual: float, nis: float) -> tuple[Verdict, float]:
@@ -186,7 +216,14 @@ class RangeGate:
         return Verdict.ACCEPTED, 1.0
 
     def _candidate(
-        self, frame: RangeFrame, i: int, pose: FloatArray, anchor: FloatArray, measured: float, sigma: float
+        self,
+        frame: RangeFrame,
+        i: int,
+        pose: FloatArray,
+        anchor: FloatArray,
+        measured: float,
+        sigma: float,
+        bias_by_pose: FloatArray,
     ) -> Candidate:
         anchor_id, stamp_ns = int(frame.anchor_ids[i]), frame.stamp_ns
         return Candidate(
@@ -195,6 +232,7 @@ class RangeGate:
             anchor,
             measured,
             sigma,
+            bias_by_pose,
             prior=self._prediction.prior(anchor_id, stamp_ns) if self._prediction else PRIOR,
             by_power=self._power.log_ratio(frame.rx_power[i], frame.fp_power[i]) if self._power else 0.0,
             by_visibility=self._visibility.log_ratio(pose, anchor) if self._visibility else 0.0,
