@@ -123,8 +123,8 @@ def ranges(
         out.print(f"  tag {tag_id} beyond that {bias.constant:+.4f} +- {bias.sigma:.4f} m")
     for tag_id, fit in bearings.items():
         out.print(
-            f"  tag {tag_id} by the anchor's bearing b ({fit.bias.cosine:+.4f} +- {fit.cosine_sigma:.4f}) cos 2b "
-            f"+ ({fit.bias.sine:+.4f} +- {fit.sine_sigma:.4f}) sin 2b m",
+            f"  tag {tag_id} by the bearing b of the anchor: cos 2b {fit.bias.cosine:+.4f} +- "
+            f"{fit.cosine_sigma:.4f} m, sin 2b {fit.bias.sine:+.4f} +- {fit.sine_sigma:.4f} m",
             soft_wrap=True,
         )
     out.print(f"  written to {to or site}, table range_bias", soft_wrap=True)

@@ -91,7 +91,7 @@ def smooth_log(
     setup = config.setup()
     track = result.poses[names[-1]]
     guess = _interpolated(log, track)
-    # The median, because a heading is often found on the way; without any it is infinite, and no bias taken off.
+    # The median, because a heading may be found on the way; infinite without any, then no bias is taken off.
     yaw_variance = float(np.median([pose.planar_cov[2, 2] for pose in track]))
     measurements = _without_bearing_biases(measurements, setup, guess, yaw_variance)
     try:

@@ -53,12 +53,12 @@ def write_range_bias(
             row = tomlkit.inline_table()
             row["constant"] = round(bias.constant, 4)
             row["constant_sigma"] = round(bias.sigma, 4)
-            fit = bearings.get(tag_id)
-            if fit is not None:
-                row["cosine"] = round(fit.bias.cosine, 4)
-                row["cosine_sigma"] = round(fit.cosine_sigma, 4)
-                row["sine"] = round(fit.bias.sine, 4)
-                row["sine_sigma"] = round(fit.sine_sigma, 4)
+            if tag_id in bearings:
+                of_bearing = bearings[tag_id]
+                row["cosine"] = round(of_bearing.bias.cosine, 4)
+                row["cosine_sigma"] = round(of_bearing.cosine_sigma, 4)
+                row["sine"] = round(of_bearing.bias.sine, 4)
+                row["sine_sigma"] = round(of_bearing.sine_sigma, 4)
             of_tags[str(tag_id)] = row
     text = tomlkit.dumps(document)
     config_from_toml(text, str(to), folder=to.parent)

@@ -70,7 +70,7 @@ class BearingBias:
         dx = anchor[0] - pose[0] - arm_x
         dy = anchor[1] - pose[1] - arm_y
         twice = 2.0 * (atan2(dy, dx) - pose[2])
-        # cos and sin of an angle of variance v, normally distributed, have exp(-v / 2) of their size on average.
+        # Of normally distributed angles of variance v the means of cos and sin are exp(-v / 2) times theirs.
         known = exp(-2.0 * yaw_variance)
         c2, s2 = known * cos(twice), known * sin(twice)
         slope = 2.0 * (self.sine * c2 - self.cosine * s2)
