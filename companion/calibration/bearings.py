@@ -1,10 +1,9 @@
 """Range biases by the direction from which a tag sees an anchor, against known poses."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from companion.calibration.ranges import Ranges, block_sums, fit_anchor, ranges_by_anchor
 from estimators.base import Setup
@@ -13,7 +12,7 @@ from estimators.models.range_bias import BearingBias, without_bearing_bias
 
 _SIGNIFICANT = 13.8
 """Chi-square of two numbers [-] that noise alone exceeds once in a thousand times."""
-_CONDITION = 1e-6
+_CONDITION, _ROUNDS = 1e-6, 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,15 +57,14 @@ def fit_bearings(
     for name in np.unique(ids).tolist():
         own = np.flatnonzero((ids == name) & np.isfinite(poses).all(axis=1)).tolist()
         by_anchor = ranges_by_anchor([frames[i] for i in own], tags[own], anchors, start_ns)
-        times = np.array([(frames[i].stamp_ns - start_ns) * 1e-9 for i in own])
-        parts = [
-            _parts(ranges, np.searchsorted(times, ranges.times), poses[own, 2], tags[own], anchors[anchor_id])
-            for anchor_id, ranges in by_anchor.items()
-        ]
-        if parts:
-            fit = _fit(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
-            if fit is not None:
-                found[name] = fit
+        times, yaws = np.array([(frames[i].stamp_ns - start_ns) * 1e-9 for i in own]), poses[own, 2]
+        seen = []
+        for anchor_id, ranges in by_anchor.items():
+            at = np.searchsorted(times, ranges.times)
+            seen.append((ranges, _regressors(ranges.distances, yaws[at], tags[own][at], anchors[anchor_id])))
+        fit = _fit(seen) if seen else None
+        if fit is not None:
+            found[name] = fit
     return found
 
 
@@ -82,25 +80,24 @@ def without_bearings(
     ]
 
 
-def _parts(
-    ranges: Ranges, frame: NDArray[np.intp], yaws: FloatArray, tags: FloatArray, anchor: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Times (K,), regressors (K, 3) and errors (K,) of an anchor's used ranges, about their means."""
-    kept = fit_anchor(ranges).kept
-    to_anchor = anchor[:2] - tags[frame[kept], :2]
-    twice = 2.0 * (np.arctan2(to_anchor[:, 1], to_anchor[:, 0]) - yaws[frame[kept]])
-    A = np.column_stack([np.cos(twice), np.sin(twice), ranges.distances[kept]])
-    errors = ranges.measured[kept] - ranges.distances[kept]
-    return ranges.times[kept], A - A.mean(axis=0), errors - errors.mean()
+def _regressors(distances: FloatArray, yaws: FloatArray, tags: FloatArray, anchor: FloatArray) -> FloatArray:
+    """What an anchor's ranges may depend on, (M, 3): cos 2b, sin 2b, distance."""
+    to_anchor = anchor[:2] - tags[:, :2]
+    twice = 2.0 * (np.arctan2(to_anchor[:, 1], to_anchor[:, 0]) - yaws)
+    return np.column_stack([np.cos(twice), np.sin(twice), distances])
 
 
-def _fit(times: FloatArray, A: FloatArray, errors: FloatArray) -> BearingFit | None:
+def _fit(seen: Sequence[tuple[Ranges, FloatArray]]) -> BearingFit | None:
     """The two numbers; None where they are not significant, or cannot be told from constants and growth."""
-    information = A.T @ A
-    if np.linalg.eigvalsh(information)[0] < _CONDITION * len(A):
-        return None
-    inverse = np.linalg.inv(information)
-    solution = inverse @ A.T @ errors
+    solution = np.zeros(3)
+    for _ in range(_ROUNDS):
+        # What is left out depends on what the ranges are held against, and the other way round.
+        times, A, errors = _used(seen, solution)
+        information = A.T @ A
+        if np.linalg.eigvalsh(information)[0] < _CONDITION * len(A):
+            return None
+        inverse = np.linalg.inv(information)
+        solution = inverse @ A.T @ errors
     sums = block_sums(A * (errors - A @ solution)[:, None], times)
     free = len(sums) - A.shape[1]
     if free <= 0:
@@ -111,3 +108,16 @@ def _fit(times: FloatArray, A: FloatArray, errors: FloatArray) -> BearingFit | N
         return None
     cosine_sigma, sine_sigma = np.sqrt(np.diag(cov)).tolist()
     return BearingFit(BearingBias(*pair.tolist()), cosine_sigma, sine_sigma)
+
+
+def _used(
+    seen: Sequence[tuple[Ranges, FloatArray]], solution: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Times (K,), regressors (K, 3) and errors (K,) of the ranges that are not blocked, about their means."""
+    parts = []
+    for ranges, A in seen:
+        kept = fit_anchor(replace(ranges, measured=ranges.measured - A @ solution)).kept
+        errors = (ranges.measured - ranges.distances)[kept]
+        parts.append((ranges.times[kept], A[kept] - A[kept].mean(axis=0), errors - errors.mean()))
+    times, regressors, errors = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+    return times, regressors, errors

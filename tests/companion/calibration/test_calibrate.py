@@ -108,6 +108,8 @@ def test_the_site_file_keeps_its_comments_and_takes_the_biases(log: Path, tmp_pa
         assert bias.constant == pytest.approx(told["anchors"][str(anchor_id)]["bias_m"], abs=2e-4)
         assert abs(bias.constant) < 0.03
     assert stored.range_bias.common_sigma > 0.0
+    # Simulated ranges have no bias by bearing, so the single tag gets no row.
+    assert not stored.range_bias.tags
     # A second calibration replaces the first.
     invoke("ranges", str(log), *options, "--until", "5")
     assert site.read_text(encoding="utf-8").count("common_sigma") == 1

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from companion.calibrate_cli import app
 from companion.calibration.recording import read_recording
 from companion.calibration.tags import fit_tags
-from companion.config import load_config, params_dir
+from companion.config import Config, load_config, params_dir
 from companion.errors import UserError
 from companion.importers.sources import import_log
 from companion.log import Log, RawChunk
@@ -38,6 +38,14 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+def without_bearing(config: Config) -> Config:
+    """The calibration with the constants of tags alone."""
+    tags = {
+        i: bias.model_copy(update={"cosine": 0.0, "sine": 0.0}) for i, bias in config.range_bias.tags.items()
+    }
+    return config.model_copy(update={"range_bias": config.range_bias.model_copy(update={"tags": tags})})
+
+
 def test_a_user_gets_position_and_heading_of_three_tags_by_commands(folder: Path) -> None:
     log, site, found = folder / "lias.mcap", folder / "site.toml", folder / "found.json"
     assert import_log(folder, log, SITE) == 3 * 295
@@ -48,20 +56,36 @@ def test_a_user_gets_position_and_heading_of_three_tags_by_commands(folder: Path
     assert "tag 0 beyond that" in done.output
     tags = json.loads(found.read_text())["tags"]
     assert sum(tag["bias_m"] for tag in tags.values()) == pytest.approx(0.0, abs=1e-9)
+    assert "tag 2 by the bearing b of the anchor: cos 2b" in done.output
     config = load_config(site)
+    for tag_id, stored in config.range_bias.tags.items():
+        written = (stored.cosine, stored.cosine_sigma, stored.sine, stored.sine_sigma)
+        names = ("cosine_m", "cosine_sigma_m", "sine_m", "sine_sigma_m")
+        assert written == pytest.approx([tags[str(tag_id)][name] for name in names], abs=1e-4)
+        assert np.hypot(stored.cosine, stored.sine) > 0.02
     assert config.tag_biases() == pytest.approx({int(i): tag["bias_m"] for i, tag in tags.items()}, abs=1e-4)
     start_ns = Log(log).start_ns
     known_ns = start_ns + round(CALIBRATED * 1e9)
     records = [r for r in Log(log) if isinstance(r, RawChunk) or r.stamp_ns > known_ns]
-    before, after = (
-        run_records(records, str(log), each, start_ns, ["ekf"])["ekf"] for each in (load_config(SITE), config)
+    before, level, after = (
+        run_records(records, str(log), each, start_ns, ["ekf"])["ekf"]
+        for each in (load_config(SITE), without_bearing(config), config)
     )
     assert before is not None
+    assert level is not None
     assert after is not None
-    assert after.rmse_m < 0.06 < before.rmse_m
+    assert after.rmse_m < 0.05 < before.rmse_m
     assert after.max_m < 0.25
     assert after.yaw_rmse_deg is not None
-    assert after.yaw_rmse_deg < 8.0
+    assert level.yaw_rmse_deg is not None
+    assert after.yaw_rmse_deg < 5.0 < level.yaw_rmse_deg
+    smoothed = []
+    for each in (without_bearing(config), config):
+        accuracy = smooth_log(Log(log), each, find_anchors=False, find_biases=False).replay.accuracy(SMOOTHED)
+        assert accuracy is not None
+        assert accuracy.yaw_rmse_deg is not None
+        smoothed.append(accuracy.yaw_rmse_deg)
+    assert smoothed[1] < 0.9 * smoothed[0]
 
 
 def test_a_smoothed_log_has_the_heading_of_three_tags_too(folder: Path) -> None:
