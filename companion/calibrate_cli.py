@@ -60,7 +60,8 @@ def ranges(
     All later runs and replays with that file take the bias off. A point file has the columns begin, end (of
     the stay, in seconds since the log began), x, y, z (of the tag's antenna, in metres). The site file
     keeps its comments and its order. Of several tags on the robot (body.tags) truth calibrates all, points
-    and lidar the one at body.tag.
+    and lidar the one at body.tag. Truth with a heading also tells what a tag's ranges add by the bearing of
+    the anchor in the body frame: it is kept where it is beyond noise.
     """
     import numpy as np
 

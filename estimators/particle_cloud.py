@@ -53,7 +53,7 @@ class ParticleCloud(FixTaker):
     """Motion, gating and output of every particle filter; how measurements change it is the subclass's.
 
     Every range of a frame, and every landmark, is gated by its NIS against the cloud before any of them
-    counts.
+    counts. What a tag's ranges add by bearing is taken off at the mean pose, for all particles alike.
     """
 
     class Config(FixTaker.Config):

@@ -50,6 +50,8 @@ def judge_ranges(
 ) -> tuple[Report, FloatArray]:
     """Verdicts on the ranges of a frame, and those that are believed as factors.
 
+    A factor keeps what is taken off by the bearing now, though the window moves later.
+
     Args:
         gate: decides; remembers which anchors it doubts.
         frame: the ranges.
