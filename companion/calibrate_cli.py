@@ -12,6 +12,7 @@ from companion.errors import UserError
 from companion.terminal import message_console, result_console
 
 if TYPE_CHECKING:
+    from companion.calibration.bearings import BearingFit
     from companion.calibration.ranges import Calibration
     from companion.config import Config
 
@@ -59,14 +60,16 @@ def ranges(
     All later runs and replays with that file take the bias off. A point file has the columns begin, end (of
     the stay, in seconds since the log began), x, y, z (of the tag's antenna, in metres). The site file
     keeps its comments and its order. Of several tags on the robot (body.tags) truth calibrates all, points
-    and lidar the one at body.tag.
+    and lidar the one at body.tag. Truth with a heading also tells what a tag's ranges add by the bearing of
+    the anchor in the body frame: it is kept where it is beyond noise.
     """
     import numpy as np
 
+    from companion.calibration.bearings import BearingFit, fit_bearings, without_bearings
     from companion.calibration.picture import residual_figure
     from companion.calibration.ranges import fit_biases, ranges_by_anchor
     from companion.calibration.recording import read_recording
-    from companion.calibration.reference import tags_from_points, tags_from_truth
+    from companion.calibration.reference import poses_from_truth, tags_from_points, tags_from_truth
     from companion.calibration.site_file import write_range_bias
     from companion.calibration.tags import TagBias, fit_tags, without_tag_bias
     from companion.config import load_config
@@ -77,18 +80,26 @@ def ranges(
         Log(log), config, until, with_odometry=against == "lidar", every_tag=against == "truth"
     )
     of_tags: dict[int, TagBias] = {}
+    bearings: dict[int, BearingFit] = {}
     if against == "lidar":
         from companion.calibration.drive import calibrate_on_drive
 
         found = calibrate_on_drive(recording, config)
     else:
+        anchors = {i: np.array(position) for i, position in config.anchors.items()}
+        frames = recording.range_frames
         if against == "truth":
-            tags = tags_from_truth(recording, config)
+            poses = poses_from_truth(recording)
+            tags = tags_from_truth(recording, poses, config)
+            bearings = fit_bearings(frames, poses, tags, anchors, recording.start_ns)
+            frames = without_bearings(frames, poses, bearings, config.setup())
         else:
             tags = tags_from_points(Path(against), recording)
-        anchors = {i: np.array(position) for i, position in config.anchors.items()}
-        of_tags = fit_tags(recording.range_frames, tags, anchors, recording.start_ns)
-        frames = [without_tag_bias(frame, of_tags) for frame in recording.range_frames]
+        of_tags = fit_tags(frames, tags, anchors, recording.start_ns)
+        # What an earlier drive said of a tag is replaced, though this one says nothing of it.
+        seen = {frame.tag_id for frame in frames} & config.range_bias.tags.keys()
+        of_tags = {i: TagBias(0.0, 0.0) for i in sorted(seen | bearings.keys())} | of_tags
+        frames = [without_tag_bias(frame, of_tags) for frame in frames]
         by_anchor = ranges_by_anchor(frames, tags, anchors, recording.start_ns)
         if not by_anchor:
             raise UserError(f"{log}: no anchor has enough ranges where the position is known")
@@ -107,13 +118,22 @@ def ranges(
         err.print(f"  picture {picture}")
         err.print("[red]nothing written: without known positions one hidden anchor spoils the bias of all[/]")
         raise typer.Exit(1)
-    write_range_bias(site, found, of_tags, to or site)
+    write_range_bias(site, found, of_tags, bearings, to or site)
     out.print(f"  common bias {found.common:+.4f} +- {found.common_sigma:.4f} m, {found.common_ns:+.2f} ns")
     for tag_id, bias in of_tags.items():
         out.print(f"  tag {tag_id} beyond that {bias.constant:+.4f} +- {bias.sigma:.4f} m")
+    for tag_id, fit in bearings.items():
+        out.print(
+            f"  tag {tag_id} by the bearing b of the anchor: cos 2b {fit.bias.cosine:+.4f} +- "
+            f"{fit.cosine_sigma:.4f} m, sin 2b {fit.bias.sine:+.4f} +- {fit.sine_sigma:.4f} m",
+            soft_wrap=True,
+        )
     out.print(f"  written to {to or site}, table range_bias", soft_wrap=True)
     out.print(f"  picture {picture}", soft_wrap=True)
-    by_tag = {str(i): {"bias_m": bias.constant, "bias_sigma_m": bias.sigma} for i, bias in of_tags.items()}
+    by_tag = {
+        str(i): {"bias_m": bias.constant, "bias_sigma_m": bias.sigma} | _bearing_figures(bearings.get(i))
+        for i, bias in of_tags.items()
+    }
     _write_json(figures, _range_figures(found) | {"tags": by_tag})
 
 
@@ -197,6 +217,17 @@ def _range_table(found: "Calibration", config: "Config") -> Table:
             str(len(fit.ranges.measured)),
         )
     return table
+
+
+def _bearing_figures(fit: "BearingFit | None") -> dict[str, float]:
+    if fit is None:
+        return {}
+    return {
+        "cosine_m": fit.bias.cosine,
+        "cosine_sigma_m": fit.cosine_sigma,
+        "sine_m": fit.bias.sine,
+        "sine_sigma_m": fit.sine_sigma,
+    }
 
 
 def _range_figures(found: "Calibration") -> dict[str, object]:

@@ -36,7 +36,7 @@ from estimators.lidar.loop_closure import LoopCloser
 from estimators.lidar.scan_matching import ScanMatcher
 from estimators.lidar.scan_preparation import ScanPreparation
 from estimators.messages import FloatArray
-from estimators.models.range_bias import RangeBias
+from estimators.models.range_bias import BearingBias, RangeBias
 from estimators.relocation.recovery import Recovering
 from estimators.trilateration import AnchorGeometryError, check_anchor_geometry
 
@@ -148,6 +148,15 @@ class TagBiasTable(Table):
 
     constant: float = Field(0.0, ge=-10, le=10, description="to every anchor [m]")
     constant_sigma: float = Field(0.0, ge=0, le=10, description="standard deviation of it [m]")
+    cosine: float = Field(
+        0.0,
+        ge=-1,
+        le=1,
+        description="and cos 2b times this, at bearing b of the anchor in the body frame [m]",
+    )
+    cosine_sigma: float = Field(0.0, ge=0, le=1, description="standard deviation of it [m]")
+    sine: float = Field(0.0, ge=-1, le=1, description="likewise sin 2b times this [m]")
+    sine_sigma: float = Field(0.0, ge=0, le=1, description="standard deviation of it [m]")
 
 
 class RangeBiasTable(Table):
@@ -361,6 +370,11 @@ class Config(Table):
             floor_map=self.site.map.floor_map() if self.site.map is not None else None,
             scan_preparation=self.scan_preparation,
             tags={i: np.array(position) for i, position in body.tags.items()},
+            bearing_biases={
+                i: BearingBias(bias.cosine, bias.sine)
+                for i, bias in self.range_bias.tags.items()
+                if bias.cosine or bias.sine
+            },
         )
 
     def range_biases(self) -> dict[int, RangeBias]:

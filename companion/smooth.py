@@ -18,7 +18,15 @@ from estimators.graph.batch import AnchorFix, Smoothed, smooth
 from estimators.graph.errors import GraphError
 from estimators.graph.recording import PLACE_SIGMA, Noise, Recording
 from estimators.graph.smoother import GraphSmoother
-from estimators.messages import FloatArray, IntArray, Measurement, PoseEstimate
+from estimators.messages import (
+    FloatArray,
+    IntArray,
+    Measurement,
+    PoseEstimate,
+    RangeFrame,
+    measurement_stamp_ns,
+)
+from estimators.models.range_bias import without_bearing_bias
 
 SMOOTHED = "smoothed"
 """Name of the smoothed track beside the estimators'."""
@@ -81,11 +89,16 @@ def smooth_log(
     assert isinstance(settings, GraphSmoother.Config)
     noise = Noise(settings.range_sigma, settings.accel_noise, settings.yaw_accel_noise)
     setup = config.setup()
+    track = result.poses[names[-1]]
+    guess = _interpolated(log, track)
+    # The median, because a heading may be found on the way; infinite without any, then no bias is taken off.
+    yaw_variance = float(np.median([pose.planar_cov[2, 2] for pose in track]))
+    measurements = _without_bearing_biases(measurements, setup, guess, yaw_variance)
     try:
         recording = Recording(measurements, setup, noise, setup.tags)
         smoothed = smooth(
             recording,
-            _interpolated(log, result.poses[names[-1]]),
+            guess,
             find_anchors,
             find_biases,
             lambda number: on_progress(0.7 + 0.05 * number) if on_progress is not None else None,
@@ -125,6 +138,23 @@ def anchors_toml(found: SmoothedLog) -> str:
         bias = f" # bias {fix.bias:+.3f} m" if fix.bias_sigma else ""
         lines.append(f"{anchor_id} = [{x:.3f}, {y:.3f}, {z:.3f}]{bias}")
     return "\n".join(lines) + "\n"
+
+
+def _without_bearing_biases(
+    measurements: Sequence[Measurement],
+    setup: Setup,
+    guess: Callable[[IntArray], FloatArray],
+    yaw_variance: float,
+) -> list[Measurement]:
+    """The measurements, and what depends on the bearing taken off their ranges at guessed poses."""
+    biases = setup.bearing_biases
+    poses = guess(np.array([measurement_stamp_ns(m) for m in measurements], dtype=np.int64))
+    return [
+        without_bearing_bias(m, biases[m.tag_id], pose, setup.anchors, setup.arm(m.tag_id), yaw_variance)
+        if isinstance(m, RangeFrame) and m.tag_id in biases
+        else m
+        for m, pose in zip(measurements, poses, strict=True)
+    ]
 
 
 def _interpolated(log: Log, poses: Sequence[PoseEstimate]) -> Callable[[IntArray], FloatArray]:

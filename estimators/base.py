@@ -9,6 +9,7 @@ import numpy as np
 from estimators.lidar.floor_map import FloorMap
 from estimators.lidar.scan_preparation import ScanPreparation
 from estimators.messages import PLANAR, FloatArray, Measurement, PoseEstimate
+from estimators.models.range_bias import BearingBias
 
 
 class Verdict(StrEnum):
@@ -120,6 +121,7 @@ class Setup:
         floor_map: made on an earlier visit, with at least one obstacle; None without.
         scan_preparation: what is done with scans beforehand.
         tags: tag id -> antenna (3,) in the body frame [m], of further tags on the same robot.
+        bearing_biases: tag id -> bias of its ranges by direction, for those who know a heading to take off.
     """
 
     anchors: dict[int, FloatArray]
@@ -134,6 +136,7 @@ class Setup:
     floor_map: FloorMap | None = None
     scan_preparation: ScanPreparation.Config = field(default_factory=ScanPreparation.Config)
     tags: dict[int, FloatArray] = field(default_factory=dict)
+    bearing_biases: dict[int, BearingBias] = field(default_factory=dict)
 
     def arm(self, tag_id: int) -> FloatArray:
         """Antenna of a tag in the body frame, (3,) [m]."""

@@ -39,7 +39,8 @@ class Ekf(FixTaker, LidarOdometry):
         count = len(frame.ranges)
         verdicts = [Verdict.ACCEPTED] * count
         residuals, nis = np.full(count, np.nan), np.full(count, np.nan)
-        for i, candidate in enumerate(self._gate.candidates(frame, self._filter.x[POSE])):
+        yaw_variance = float(self._filter.P[2, 2])
+        for i, candidate in enumerate(self._gate.candidates(frame, self._filter.x[POSE], yaw_variance)):
             if isinstance(candidate, Verdict):
                 verdicts[i] = candidate
                 continue
@@ -48,7 +49,7 @@ class Ekf(FixTaker, LidarOdometry):
                 self._filter.x[POSE], candidate.anchor, self._setup.arm(frame.tag_id)
             )
             H = np.zeros((1, 9))
-            H[0, POSE] = by_pose
+            H[0, POSE] = by_pose + candidate.bias_by_pose
             variance = float((H @ self._filter.P @ H.T).item()) + sigma**2
             residuals[i] = measured - predicted
             nis[i] = residuals[i] ** 2 / variance

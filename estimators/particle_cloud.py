@@ -52,7 +52,7 @@ class ParticleCloud(FixTaker):
     """Motion, gating and output of every particle filter; how measurements change it is the subclass's.
 
     Every range of a frame, and every landmark, is gated by its NIS against the cloud before any of them
-    counts.
+    counts. What a tag's ranges add by bearing is taken off at the mean pose, for all particles alike.
     """
 
     class Config(FixTaker.Config):
@@ -160,7 +160,8 @@ class ParticleCloud(FixTaker):
         verdicts = [Verdict.ACCEPTED] * count
         innovations, nis = np.full(count, np.nan), np.full(count, np.nan)
         candidates: list[tuple[int, Candidate]] = []
-        for i, item in enumerate(self._gate.candidates(frame, self.mean)):
+        pose, spread = self._cloud.moments(self._particles, self._weights, 3)
+        for i, item in enumerate(self._gate.candidates(frame, pose, spread[2, 2])):
             if isinstance(item, Verdict):
                 verdicts[i] = item
             else:

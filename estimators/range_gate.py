@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from math import sqrt
 from typing import Literal, TypeAlias
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from estimators import chi2
@@ -17,9 +18,12 @@ from estimators.nlos.prediction import PRIOR, Prediction, excess_log_ratio
 from estimators.nlos.robust import sigma_factor
 from estimators.nlos.visibility import OBSTRUCTED, Visibility
 
+_NO_BIAS = np.zeros(3)
+
 NlosMethod = Literal["prediction", "power", "visibility", "robust"]
-Reduced: TypeAlias = tuple[FloatArray, float, float]
-"""Anchor (3,), horizontal range to it and the standard deviation of that [m]."""
+Reduced: TypeAlias = tuple[FloatArray, float, float, FloatArray]
+"""Anchor (3,), horizontal range to it and the standard deviation of that [m], derivative (3,) by the pose of
+what was taken off for the bearing."""
 
 
 @dataclass(slots=True, eq=False)  # not frozen: that costs four times as much to make, four times a frame
@@ -33,6 +37,7 @@ class Candidate:
         measured: horizontal range [m].
         sigma: its standard deviation [m].
         prior: log-odds of its anchor being blocked, by what was known before this frame.
+        bias_by_pose: (3,) derivative of what was taken off for the bearing by (x, y, yaw).
         by_power: log-likelihood ratio of its powers.
         pose: (3,) x [m], y [m], yaw [rad] that the body is predicted at.
     """
@@ -42,6 +47,7 @@ class Candidate:
     anchor: FloatArray
     measured: float
     sigma: float
+    bias_by_pose: FloatArray
     prior: float
     by_power: float
     pose: FloatArray
@@ -59,23 +65,47 @@ class HorizontalRanges:
         self._sigma = sigma
         self._anchors = {i: (anchor, setup.height_to(anchor)) for i, anchor in setup.anchors.items()}
         self._lifts = {i: float(arm[2] - setup.tag_in_body[2]) for i, arm in setup.tags.items()}
+        self._arm, self._bearing_biases = setup.arm, setup.bearing_biases
         self._newest: tuple[RangeFrame, list[Verdict | Reduced]] | None = None
 
-    def of(self, frame: RangeFrame) -> list[Verdict | Reduced]:
-        """For each range of a frame what it is in the plane, or what is wrong with it."""
+    def of(
+        self, frame: RangeFrame, pose: FloatArray | None = None, yaw_variance: float = 0.0
+    ) -> list[Verdict | Reduced]:
+        """For each range of a frame what it is in the plane, or what is wrong with it.
+
+        Args:
+            frame: with N ranges.
+            pose: (3,) predicted x [m], y [m], yaw [rad] of the body in the map; None: that bias stays.
+            yaw_variance: of its yaw [rad^2].
+        """
+        bias = None if pose is None else self._bearing_biases.get(frame.tag_id)
+        if bias is not None and pose is not None:
+            arm = self._arm(frame.tag_id)
+            return self._reduced(frame, lambda anchor: bias.at(pose, anchor, arm, yaw_variance))
         # A filter asks, and a graph behind it asks again.
         if self._newest is None or self._newest[0] is not frame:
-            lift = self._lifts.get(frame.tag_id, 0.0)
-            pairs = zip(frame.anchor_ids.tolist(), frame.ranges.tolist(), strict=True)
-            self._newest = frame, [self._reduced(anchor_id, slant, lift) for anchor_id, slant in pairs]
+            self._newest = frame, self._reduced(frame, lambda _: (0.0, _NO_BIAS))
         return self._newest[1]
 
-    def _reduced(self, anchor_id: int, slant: float, lift: float) -> Verdict | Reduced:
-        if anchor_id not in self._anchors:
-            return Verdict.UNKNOWN_ANCHOR
-        anchor, height = self._anchors[anchor_id]
-        reduced = reduce_height(slant, self._sigma, height - lift)
-        return Verdict.IMPOSSIBLE if reduced is None else (anchor, *reduced)
+    def _reduced(
+        self, frame: RangeFrame, bias_to: Callable[[FloatArray], tuple[float, FloatArray]]
+    ) -> list[Verdict | Reduced]:
+        lift = self._lifts.get(frame.tag_id, 0.0)
+        found: list[Verdict | Reduced] = []
+        for anchor_id, slant in zip(frame.anchor_ids.tolist(), frame.ranges.tolist(), strict=True):
+            if anchor_id not in self._anchors:
+                found.append(Verdict.UNKNOWN_ANCHOR)
+                continue
+            anchor, height = self._anchors[anchor_id]
+            longer, by_pose = bias_to(anchor)
+            reduced = reduce_height(slant - longer, self._sigma, height - lift)
+            if reduced is None:
+                found.append(Verdict.IMPOSSIBLE)
+                continue
+            # What is taken off the slant range changes the horizontal one as the noise does.
+            by_pose = by_pose if by_pose is _NO_BIAS else by_pose * (reduced[1] / self._sigma)
+            found.append((anchor, *reduced, by_pose))
+        return found
 
 
 class RangeGate:
@@ -154,19 +184,22 @@ class RangeGate:
         if self._visibility is not None:
             self._visibility.see(measurement, pose_at)
 
-    def candidates(self, frame: RangeFrame, pose: FloatArray) -> list[Verdict | Candidate]:
+    def candidates(
+        self, frame: RangeFrame, pose: FloatArray, yaw_variance: float
+    ) -> list[Verdict | Candidate]:
         """For each range of a frame what is known before its residual, or what is wrong with it.
 
         Args:
             frame: with N ranges.
             pose: (3,) predicted x [m], y [m], yaw [rad] of the body in the map.
+            yaw_variance: of its yaw [rad^2].
         """
-        reduced, pose = self.horizontal.of(frame), pose.copy()
+        reduced, pose = self.horizontal.of(frame, pose, yaw_variance), pose.copy()
         signals = zip(
             frame.anchor_ids.tolist(), frame.rx_power.tolist(), frame.fp_power.tolist(), strict=True
         )
         return [
-            item if isinstance(item, Verdict) else self._candidate(frame.stamp_ns, pose, *signal, *item)
+            item if isinstance(item, Verdict) else self._candidate(frame.stamp_ns, pose, signal, item)
             for item, signal in zip(reduced, signals, strict=True)
         ]
 
@@ -216,16 +249,14 @@ class RangeGate:
         self,
         stamp_ns: int,
         pose: FloatArray,
-        anchor_id: int,
-        rx_power: float,
-        fp_power: float,
-        anchor: FloatArray,
-        measured: float,
-        sigma: float,
+        signal: tuple[int, float, float],
+        reduced: Reduced,
     ) -> Candidate:
+        anchor_id, rx_power, fp_power = signal
+        anchor, measured, sigma, bias_by_pose = reduced
         prior = self._prediction.prior(anchor_id, stamp_ns) if self._prediction else PRIOR
         by_power = self._power.log_ratio(rx_power, fp_power) if self._power else 0.0
-        return Candidate(anchor_id, stamp_ns, anchor, measured, sigma, prior, by_power, pose)
+        return Candidate(anchor_id, stamp_ns, anchor, measured, sigma, bias_by_pose, prior, by_power, pose)
 
     def _looked(self, candidate: Candidate, log_odds: float) -> float:
         """What the LiDAR sees says of a range, if it can change what is thought of it.

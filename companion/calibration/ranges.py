@@ -173,7 +173,7 @@ def fit_anchor(ranges: Ranges, growth: float = 0.0, growth_sigma: float = 0.0) -
     off = errors[kept] - constant
     return AnchorFit(
         RangeBias(constant, growth, centre),
-        float(np.sqrt(_block_sums(off, ranges.times[kept]) / len(off) ** 2)),
+        float(np.linalg.norm(block_sums(off, ranges.times[kept]))) / len(off),
         growth_sigma,
         float(off.std()),
         kept,
@@ -200,14 +200,16 @@ def _common_growth(fits: Mapping[int, AnchorFit]) -> tuple[float, float]:
         return 0.0, np.inf
     growth = product / information
     for lever, errors, times in told:
-        scatter += _block_sums(lever * (errors - growth * lever), times)
+        scatter += float((block_sums(lever * (errors - growth * lever), times) ** 2).sum())
     return growth, float(np.sqrt(scatter)) / information
 
 
-def _block_sums(scores: FloatArray, times: FloatArray) -> float:
-    """Sum of the squares of the sums of scores (N,) over blocks of time."""
+def block_sums(scores: FloatArray, times: FloatArray) -> FloatArray:
+    """Sums (B, ...) of scores (N, ...) over the blocks of time [s] in which errors are taken to be alike."""
     blocks = np.unique((times / _BLOCK).astype(np.int64), return_inverse=True)[1]
-    return float((np.bincount(blocks, scores) ** 2).sum())
+    sums = np.zeros((blocks.max() + 1, *scores.shape[1:]))
+    np.add.at(sums, blocks, scores)
+    return sums
 
 
 def trim_limit(errors: FloatArray) -> float:

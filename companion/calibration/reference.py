@@ -16,25 +16,40 @@ from estimators.messages import FloatArray
 POINT_COLUMNS = ["begin", "end", "x", "y", "z"]
 
 
-def tags_from_truth(recording: Recording, config: Config) -> FloatArray:
-    """Positions (N, 3) [m] of each range frame's tag, from the poses that the log holds as truth.
+def poses_from_truth(recording: Recording) -> FloatArray:
+    """Poses (N, 3) x [m], y [m], yaw [rad] at the range frames by the log's truth; NaN outside of it.
 
     Raises:
-        UserError: there is no truth, or it lacks the heading that the tag's place on the robot needs.
+        UserError: there is no truth.
     """
     if not recording.truths:
         raise UserError("--against truth: the log holds none; give surveyed points or lidar")
     reference = Reference(recording.truths)
     stamps = [frame.stamp_ns for frame in recording.range_frames]
     poses = reference.at(stamps)
+    poses[[not reference.covers(stamp_ns) for stamp_ns in stamps]] = np.nan
+    return poses
+
+
+def tags_from_truth(recording: Recording, poses: FloatArray, config: Config) -> FloatArray:
+    """Positions (N, 3) [m] of each range frame's tag.
+
+    Args:
+        recording: of the frames.
+        poses: (N, 3) as of `poses_from_truth`.
+        config: of the site.
+
+    Raises:
+        UserError: the poses lack the heading that the tag's place on the robot needs.
+    """
     setup = config.setup()
     arms = np.array([setup.arm(frame.tag_id) for frame in recording.range_frames])
     tags = np.column_stack([poses[:, :2], config.body.height + arms[:, 2]])
     if arms[:, :2].any():
-        if not np.isfinite(poses[:, 2]).all():
+        if not np.isfinite(poses[np.isfinite(poses[:, 0]), 2]).all():
             raise UserError("--against truth: it has no heading, and body.tag is not at the body's origin")
         tags[:, :2] = transform_each(poses, arms[:, :2])
-    tags[[not reference.covers(stamp_ns) for stamp_ns in stamps]] = np.nan
+    tags[~np.isfinite(poses[:, 0])] = np.nan
     return tags
 
 

@@ -7,6 +7,7 @@ from typing import Any
 import tomlkit
 from tomlkit.items import Table
 
+from companion.calibration.bearings import BearingFit
 from companion.calibration.ranges import Calibration
 from companion.calibration.tags import TagBias
 from companion.config import config_from_toml
@@ -14,13 +15,20 @@ from companion.errors import UserError
 from companion.text_file import read_text
 
 
-def write_range_bias(site: Path, calibration: Calibration, tags: Mapping[int, TagBias], to: Path) -> None:
+def write_range_bias(
+    site: Path,
+    calibration: Calibration,
+    tags: Mapping[int, TagBias],
+    bearings: Mapping[int, BearingFit],
+    to: Path,
+) -> None:
     """Put a calibration into the table `[range_bias]` of a site file.
 
     Args:
         site: file to read.
         calibration: what to write.
         tags: tag id -> bias beyond it.
+        bearings: tag id -> what depends on the bearing; of `tags` those that it lacks have none.
         to: file to write; may be the same.
 
     Raises:
@@ -45,6 +53,12 @@ def write_range_bias(site: Path, calibration: Calibration, tags: Mapping[int, Ta
             row = tomlkit.inline_table()
             row["constant"] = round(bias.constant, 4)
             row["constant_sigma"] = round(bias.sigma, 4)
+            if tag_id in bearings:
+                of_bearing = bearings[tag_id]
+                row["cosine"] = round(of_bearing.bias.cosine, 4)
+                row["cosine_sigma"] = round(of_bearing.cosine_sigma, 4)
+                row["sine"] = round(of_bearing.bias.sine, 4)
+                row["sine_sigma"] = round(of_bearing.sine_sigma, 4)
             of_tags[str(tag_id)] = row
     text = tomlkit.dumps(document)
     config_from_toml(text, str(to), folder=to.parent)

@@ -50,6 +50,8 @@ def judge_ranges(
 ) -> tuple[Report, FloatArray]:
     """Verdicts on the ranges of a frame, and those that are believed as factors.
 
+    A factor keeps what is taken off by the bearing now, though the window moves later.
+
     Args:
         gate: decides; remembers which anchors it doubts.
         frame: the ranges.
@@ -64,12 +66,12 @@ def judge_ranges(
     verdicts = [Verdict.ACCEPTED] * count
     residuals, nis = np.full(count, np.nan), np.full(count, np.nan)
     believed = []
-    for i, candidate in enumerate(gate.candidates(frame, belief.mean[:3])):
+    for i, candidate in enumerate(gate.candidates(frame, belief.mean[:3], belief.cov[2, 2])):
         if isinstance(candidate, Verdict):
             verdicts[i] = candidate
             continue
         predicted, by_pose = horizontal_range(belief.mean, candidate.anchor, arm)
-        H, R = by_pose[None], np.array([[candidate.sigma**2]])
+        H, R = (by_pose + candidate.bias_by_pose)[None], np.array([[candidate.sigma**2]])
         residuals[i] = candidate.measured - predicted
         nis[i] = residuals[i] ** 2 / belief.spread(H, R).item()
         verdicts[i], factor = gate.judge(candidate, residuals[i], nis[i])
@@ -82,6 +84,8 @@ def judge_ranges(
 def believed_ranges(
     horizontal: HorizontalRanges,
     frame: RangeFrame,
+    pose: FloatArray,
+    yaw_variance: float,
     verdicts: Sequence[Verdict],
     arm: FloatArray,
     numbers: Mapping[int, int],
@@ -93,14 +97,16 @@ def believed_ranges(
     Args:
         horizontal: height reduction, as the filter's.
         frame: the ranges.
+        pose: (3,) predicted x [m], y [m], yaw [rad] of the body in the map.
+        yaw_variance: of its yaw [rad^2].
         verdicts: the filter's on each of them.
         arm: (3,) tag antenna in the body frame [m].
         numbers: anchor id -> variable in the graph.
     """
     believed = [
-        (numbers[anchor_id], *item[1:])
+        (numbers[anchor_id], *item[1:3])
         for anchor_id, verdict, item in zip(
-            frame.anchor_ids.tolist(), verdicts, horizontal.of(frame), strict=True
+            frame.anchor_ids.tolist(), verdicts, horizontal.of(frame, pose, yaw_variance), strict=True
         )
         if verdict is Verdict.ACCEPTED and not isinstance(item, Verdict)
     ]

@@ -56,6 +56,8 @@ class PfIbasGraph(GraphSmoother):
         rows = self._judging.believed_ranges(
             self._gate.horizontal,
             frame,
+            mean[:3],
+            cov[2, 2],
             self._said.verdicts,
             self._setup.arm(frame.tag_id),
             self._anchor_numbers,

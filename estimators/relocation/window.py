@@ -118,7 +118,7 @@ class Window:
             if isinstance(item, Verdict):
                 verdicts.append(item)
             else:
-                anchor, measured, sigma = item
+                anchor, measured, sigma, _ = item
                 verdicts.append(Verdict.WAITING)
                 rows.append((anchor[0], anchor[1], anchor_id, measured, sigma))
         if rows:

@@ -37,7 +37,7 @@ def frame_at(k: int, excess: FloatArray, difference: float | FloatArray = NO_POW
 
 def judged(of: RangeGate, k: int, residual: float, difference: float = NO_POWER) -> Verdict:
     """Verdict on the first range of a frame."""
-    candidate = of.candidates(frame_at(k, np.zeros(4), difference), POSE)[0]
+    candidate = of.candidates(frame_at(k, np.zeros(4), difference), POSE, 0.0)[0]
     assert isinstance(candidate, Candidate)
     verdict, _ = of.judge(candidate, residual, (residual / EXPECTED_SIGMA) ** 2)
     return verdict
@@ -140,7 +140,7 @@ def test_robust_uses_every_range_that_is_not_too_short_but_counts_the_long_ones_
     soft = gate("robust")
     factors = []
     for k, residual in enumerate((0.0, 0.2, 0.4, 2.0)):
-        candidate = soft.candidates(frame_at(k, np.zeros(4)), POSE)[0]
+        candidate = soft.candidates(frame_at(k, np.zeros(4)), POSE, 0.0)[0]
         assert isinstance(candidate, Candidate)
         verdict, factor = soft.judge(candidate, residual, (residual / EXPECTED_SIGMA) ** 2)
         assert verdict is (Verdict.DOWNWEIGHTED if residual >= 0.4 else Verdict.ACCEPTED)
@@ -175,7 +175,7 @@ def test_what_is_no_range_says_what_is_wrong() -> None:
         ranges=np.array([np.nan, -3.0, 0.5, 5.0]),
     )
     wrong = Verdict.IMPOSSIBLE
-    assert gate("prediction").candidates(bad, POSE) == [wrong, wrong, wrong, Verdict.UNKNOWN_ANCHOR]
+    assert gate("prediction").candidates(bad, POSE, 0.0) == [wrong, wrong, wrong, Verdict.UNKNOWN_ANCHOR]
 
 
 FILTERS = ["ekf", "graph", "pf", "pf_ibas", "pf_ibas_graph"]

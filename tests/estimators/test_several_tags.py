@@ -69,7 +69,7 @@ def test_ranges_are_reduced_by_the_height_of_their_own_tag() -> None:
         tag = transform(START.pose, arm[None, :2])[0]
         for item in horizontal.of(frame_of(tag_id, 0, START.pose)):
             assert not isinstance(item, Verdict)
-            anchor, reduced, _ = item
+            anchor, reduced, *_ = item
             assert reduced == pytest.approx(float(np.linalg.norm(anchor[:2] - tag)))
 
 

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 from companion.calibrate_cli import app
 from companion.calibration.drive import calibrate_on_drive, mounting_on_drive
 from companion.calibration.recording import Recording, read_recording
-from companion.config import Config, load_config
+from companion.config import Config, TagBiasTable, load_config
 from companion.errors import UserError
 from companion.log import Log, RawChunk, Truth
 from companion.log_edit.edit import edit_log
@@ -108,10 +108,17 @@ def test_the_site_file_keeps_its_comments_and_takes_the_biases(log: Path, tmp_pa
         assert bias.constant == pytest.approx(told["anchors"][str(anchor_id)]["bias_m"], abs=2e-4)
         assert abs(bias.constant) < 0.03
     assert stored.range_bias.common_sigma > 0.0
-    # A second calibration replaces the first.
+    # Simulated ranges have no bias by bearing, so the single tag gets no row.
+    assert not stored.range_bias.tags
+    # A second calibration replaces the first, and what another drive said of the tag.
+    tag_id = read_recording(Log(log), stored, 1.0, with_odometry=False).range_frames[0].tag_id
+    with site.open("a", encoding="utf-8") as file:
+        file.write(f"[range_bias.tags]\n{tag_id} = {{ constant = 0.1, cosine = 0.05 }}\n")
     invoke("ranges", str(log), *options, "--until", "5")
     assert site.read_text(encoding="utf-8").count("common_sigma") == 1
-    assert load_config(site).range_bias.common != stored.range_bias.common
+    again = load_config(site).range_bias
+    assert again.common != stored.range_bias.common
+    assert again.tags == {tag_id: TagBiasTable()}
 
 
 def test_a_hidden_anchor_lets_nothing_be_written_that_was_found_against_the_lidar(
