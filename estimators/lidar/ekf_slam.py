@@ -79,9 +79,7 @@ class EkfSlam:
 
         self._config = config
         self._T_body_lidar = T_body_lidar
-        # A feature is a run of neighbouring beams: with some left out it would seem to have holes.
-        whole = (preparation or ScanPreparation.Config()).model_copy(update={"spacing": 0.0})
-        self._preparation = ScanPreparation(whole, T_body_lidar)
+        self._preparation = ScanPreparation(preparation or ScanPreparation.Config(), T_body_lidar)
         self.map: FeatureMap | None = None
         """Motion and features as estimated; None before the first feature."""
         self._keyframe_ns = self._stamp_ns = 0

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from estimators.kernels import scan_fit as kernels
 from estimators.kernels.scan_lines import associate, fit_lines, sort_into_cells
@@ -30,6 +31,11 @@ class Surface:
     spans: IntArray
     own: IntArray
     points: FloatArray
+
+    def of(self, chosen: NDArray[np.bool_]) -> "Surface":
+        """Those of some of the scan's points (N,)."""
+        some = chosen[self.own]
+        return Surface(self.lines[some], self.spans[some], self.own[some], self.points[some])
 
     @property
     def normals(self) -> FloatArray:

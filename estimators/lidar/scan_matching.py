@@ -208,7 +208,8 @@ class ScanMatcher:
         expected = expect(
             scan, self._stamp_ns, self._state, self._cov, self._noise, self.odometry, self._gyro
         )
-        found = self._line_map.surface(expected.points, config.range_sigma)
+        # Lines go through all points; by count, what is near the scanner would outweigh the room.
+        found = self._line_map.surface(expected.points, config.range_sigma).of(scan.apart)
         basis = expected.basis[found.own]
         F, Q = expected.F, expected.Q
         motion = np.hstack([-F, np.eye(6)])

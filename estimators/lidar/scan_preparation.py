@@ -23,11 +23,13 @@ class PreparedScan:
         stamp_ns: time of the last beam, whether it came back or not.
         points: (N, 2) [m] in the order of the beams, each in the level body frame of its own instant.
         times: (N,) [s] of the beams, relative to `stamp_ns` (zero or negative).
+        apart: (N,) which of them have the spacing that was asked for between them.
     """
 
     stamp_ns: int
     points: FloatArray
     times: FloatArray
+    apart: NDArray[np.bool_]
 
 
 class ScanPreparation:
@@ -90,8 +92,8 @@ class ScanPreparation:
             good = (scan.ranges > 0.0) & (scan.ranges >= config.min_range) & (scan.ranges <= config.max_range)
         good &= np.isfinite(scan.angles)
         kept = np.flatnonzero(good)
-        kept = kept[_spread(scan.angles[kept], scan.ranges[kept], config.spacing)]
         kept = kept[:: -(-len(kept) // config.max_points) or 1]
+        apart = _spread(scan.angles[kept], scan.ranges[kept], config.spacing)
         angles, ranges, stamp_ns = scan.angles[kept], scan.ranges[kept], scan.end_stamp_ns
         in_lidar = np.column_stack([ranges * np.cos(angles), ranges * np.sin(angles)])
         points = transform(self._T_body_lidar, in_lidar)
@@ -101,8 +103,8 @@ class ScanPreparation:
             if age <= MOST_ATTITUDE_AGE:
                 level = points @ _tilt(self._attitude.quat_wxyz)[:, :2].T
                 near = np.abs(level[:, 2]) <= config.max_rise
-                points, times = np.ascontiguousarray(level[near, :2]), times[near]
-        return PreparedScan(stamp_ns, points, times)
+                points, times, apart = np.ascontiguousarray(level[near, :2]), times[near], apart[near]
+        return PreparedScan(stamp_ns, points, times, apart)
 
 
 def _spread(angles: FloatArray, ranges: FloatArray, spacing: float) -> NDArray[np.bool_]:

@@ -81,9 +81,10 @@ def test_an_attitude_that_is_none_or_old_levels_nothing(quat: list[float]) -> No
 
 
 @pytest.mark.parametrize(("distance", "between"), [(0.3, 4), (1.5, 1), (8.0, 1)])
-def test_near_returns_are_thinned_to_a_spacing(distance: float, between: int) -> None:
+def test_of_near_returns_those_are_told_that_are_a_spacing_apart(distance: float, between: int) -> None:
     # Beams are 1 deg apart: 5 mm at 0.3 m. Noise of the ranges, larger than that, changes nothing.
     noisy = distance + np.random.default_rng(0).normal(0.0, 0.015, 360)
     prepared = preparation(spacing=0.02).prepare(scan_of(noisy))
-    assert len(prepared.points) == pytest.approx(360 / between, rel=0.08)
-    assert len(preparation(spacing=0.0).prepare(scan_of(noisy)).points) == 360
+    assert len(prepared.points) == 360
+    assert prepared.apart.sum() == pytest.approx(360 / between, rel=0.08)
+    assert preparation(spacing=0.0).prepare(scan_of(noisy)).apart.all()
