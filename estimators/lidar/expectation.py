@@ -21,6 +21,9 @@ _WAVES = np.pi * np.arange(1, 7)
 """Wave numbers of a Brownian bridge's modes; what is left out has a seventh of its variance."""
 _CLAMPED_WAVES = np.array([4.730040745, 7.853204624, 10.995607838])
 """Of a bar clamped at both ends; what is left out has a hundredth of the variance."""
+_CLAMPED_RATIOS = (np.cosh(_CLAMPED_WAVES) - np.cos(_CLAMPED_WAVES)) / (
+    np.sinh(_CLAMPED_WAVES) - np.sin(_CLAMPED_WAVES)
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,8 +79,7 @@ def bridge(shares: FloatArray) -> FloatArray:
 
 def clamped_bar(shares: FloatArray) -> FloatArray:
     """Modes (3, M) by which motion under white acceleration deviates from a cubic, of unit power."""
-    waves = _CLAMPED_WAVES[:, None]
-    ratio = (np.cosh(waves) - np.cos(waves)) / (np.sinh(waves) - np.sin(waves))
+    waves, ratio = _CLAMPED_WAVES[:, None], _CLAMPED_RATIOS[:, None]
     phases = waves * np.clip(shares, 0.0, 1.0)
     shape = np.cosh(phases) - np.cos(phases) - ratio * (np.sinh(phases) - np.sin(phases))
     modes: FloatArray = shape / waves**2

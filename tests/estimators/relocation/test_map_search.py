@@ -138,7 +138,7 @@ def test_a_standing_robot_without_ranges_is_found_a_little_later() -> None:
 
 @pytest.mark.parametrize(("min_range", "is_found"), [(0.1, False), (0.5, True)])
 def test_limits_of_the_site_hold_in_the_search(min_range: float, is_found: bool) -> None:
-    preparation = ScanPreparation.Config(min_range=min_range, spacing=0.0)
+    preparation = ScanPreparation.Config(min_range=min_range)
     estimator = recovering(replace(in_map(FURNISHED), scan_preparation=preparation))
     now_ns = 0
     for measurement in stream(FURNISHED, standing(POSE), 1.0):
