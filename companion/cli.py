@@ -2,7 +2,6 @@
 
 import logging
 import os
-import signal
 import sys
 import threading
 import time
@@ -21,6 +20,7 @@ from companion.calibrate_cli import app as calibrate_app
 from companion.doctor import app as doctor
 from companion.errors import UserError
 from companion.evaluate_cli import app as evaluate_app
+from companion.interrupt import set_by_signals
 from companion.log_cli import edit, export, import_recording, make_map
 from companion.params_cli import app as params_app
 from companion.review_cli import review
@@ -172,12 +172,11 @@ def run(
 
     live = LiveRun(config, folder, say, view=_shown(view))
     say(f"{config.site.name}: estimator {config.pipeline.estimator}, log {folder / 'raw.mcap'}")
-    stop = threading.Event()
-    _stop_on_signal(stop)
-    reporter = threading.Thread(target=_report, args=(live, stop), daemon=True)
-    reporter.start()
-    live.run(stop)
-    reporter.join()
+    with set_by_signals() as stop:
+        reporter = threading.Thread(target=_report, args=(live, stop), daemon=True)
+        reporter.start()
+        live.run(stop)
+        reporter.join()
     say(f"ended: {live.status.poses_sent} poses sent; replay with: companion replay {folder / 'raw.mcap'}")
 
 
@@ -230,9 +229,8 @@ def emulate(scenario: Scenario_, seed: Seed = None, view: View = "off", sets: Se
         site = _scenario_path(scenario).parent / loaded.file.site
         err.print("In another terminal:")
         err.print(f"  companion run --site {site.resolve()} {options}")
-        stop = threading.Event()
-        _stop_on_signal(stop)
-        emulator.run(stop, lambda line: err.print(line))
+        with set_by_signals() as stop:
+            emulator.run(stop, lambda line: err.print(line))
     finally:
         emulator.close()
         if shown is not None:
@@ -437,11 +435,6 @@ def _play(log: "Log", config: "Config", primary: str, speed: float) -> None:
     out.print(f"{player.poses_sent} poses sent")
     for line in player.score.lines():
         out.print(line, markup=False, soft_wrap=True)
-
-
-def _stop_on_signal(stop: threading.Event) -> None:
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
 
 
 def _report(live: "LiveRun", stop: threading.Event) -> None:

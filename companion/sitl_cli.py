@@ -1,6 +1,5 @@
 """`companion sitl`: let a simulated vehicle fly on our pose alone."""
 
-import signal
 import threading
 import time
 from datetime import datetime
@@ -10,6 +9,7 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 
+from companion.interrupt import set_by_signals
 from companion.terminal import message_console, result_console
 
 EXIT_NOT_FOLLOWED = 1
@@ -60,14 +60,12 @@ def sitl(
 
     say(f"waiting for the autopilot on {connect}")
     run = SitlRun(load_scenario(path, seed, sets or []), connect, folder, say)
-    stop = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
-    if seconds is not None:
-        timer = threading.Timer(seconds, stop.set)
-        timer.daemon = True
-        timer.start()
-    run.run(stop)
+    with set_by_signals() as stop:
+        if seconds is not None:
+            timer = threading.Timer(seconds, stop.set)
+            timer.daemon = True
+            timer.start()
+        run.run(stop)
     errors = run.our_errors()
     if len(errors):
         rmse = float(np.sqrt(np.mean(np.square(errors))))

@@ -1,10 +1,8 @@
 """Rerun's own viewer as a process beside ours: in a window, or as a page for a browser."""
 
 import os
-import signal
 import socket
 import subprocess
-import threading
 import time
 from importlib.util import find_spec
 from pathlib import Path
@@ -12,6 +10,7 @@ from typing import Literal
 
 from companion.config import ViewTable
 from companion.errors import UserError
+from companion.interrupt import set_by_signals
 
 Mode = Literal["web", "native"]
 Shown = Literal["web", "native", "off"]
@@ -101,11 +100,9 @@ class Viewer:
 
     def serve_until_interrupted(self) -> None:
         """Wait for Ctrl-C, or until it ends by itself; then end it."""
-        stop = threading.Event()
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, lambda *_: stop.set())
-        while self.is_running and not stop.wait(0.2):
-            pass
+        with set_by_signals() as stop:
+            while self.is_running and not stop.wait(0.2):
+                pass
         self.kill()
 
     def kill(self) -> None:
