@@ -1,6 +1,9 @@
 """How kernels are compiled."""
 
+import re
+import sys
 from collections.abc import Callable
+from functools import cache
 from hashlib import sha256
 from pathlib import Path
 from typing import TypeVar, cast
@@ -12,23 +15,27 @@ Function = TypeVar("Function", bound=Callable[..., object])
 MATRIX, VECTOR, INDICES = "float64[:, ::1]", "float64[::1]", "int64[::1]"
 
 
-def _digest_of_kernels() -> str:
-    sources = sorted(Path(__file__).parent.glob("*.py"))
-    return sha256(b"".join(source.read_bytes() for source in sources)).hexdigest()[:8]
+KERNELS = re.compile(r"^from (\w+\.kernels\.\w+) import", re.MULTILINE)
+"""What a module of kernels says of the others that it calls."""
 
 
-_DIGEST = _digest_of_kernels()
+@cache
+def _sources(module: str) -> frozenset[str]:
+    """Source of a loaded module of kernels, and of those that it calls."""
+    source = Path(str(sys.modules[module].__file__)).read_text()
+    return frozenset({source}).union(*map(_sources, KERNELS.findall(source)))
 
 
 def compiled(signature: str) -> Callable[[Function], Function]:
     """Compile for these types when the module is loaded, not when the robot already walks.
 
     What is kept on disk is known by the function's name and the age of its file, but not of the files of what
-    it calls. So the name is given a digest of them all.
+    it calls. So the name is given a digest of its module and of those that it calls.
     """
 
     def compile_or_load(function: Function) -> Function:
-        function.__qualname__ += f"_{_DIGEST}"
+        sources = "".join(sorted(_sources(function.__module__)))
+        function.__qualname__ += f"_{sha256(sources.encode()).hexdigest()[:8]}"
         return cast("Function", njit(signature, cache=True, error_model="numpy")(function))
 
     return compile_or_load
