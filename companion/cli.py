@@ -5,6 +5,7 @@ import os
 import sys
 import threading
 import time
+from contextlib import ExitStack
 from datetime import datetime
 from math import degrees
 from pathlib import Path
@@ -170,9 +171,9 @@ def run(
     def say(line: str) -> None:
         err.print(f"[dim]{time.monotonic() - begin:8.1f}[/]  {escape(line)}")
 
-    live = LiveRun(config, folder, say, view=_shown(view))
-    say(f"{config.site.name}: estimator {config.pipeline.estimator}, log {folder / 'raw.mcap'}")
     with set_by_signals() as stop:
+        live = LiveRun(config, folder, say, view=_shown(view))
+        say(f"{config.site.name}: estimator {config.pipeline.estimator}, log {folder / 'raw.mcap'}")
         reporter = threading.Thread(target=_report, args=(live, stop), daemon=True)
         reporter.start()
         live.run(stop)
@@ -213,15 +214,17 @@ def emulate(scenario: Scenario_, seed: Seed = None, view: View = "off", sets: Se
 
     loaded = _load_scenario(scenario, seed, sets)
     where = _shown(view)
-    emulator = Emulator(loaded)
-    shown = None
-    try:
+    with ExitStack() as closing:
+        stop = closing.enter_context(set_by_signals())
+        emulator = Emulator(loaded)
+        closing.callback(emulator.close)
         if where != "off":
             # Rerun would tell of every viewer that was closed.
             os.environ.setdefault("RUST_LOG", "off")
             from companion.view.walk_view import WalkView
 
             shown = WalkView(emulator.robot, where, lambda line: err.print(line, soft_wrap=True))
+            closing.callback(shown.close)
         for name, port in emulator.ports.items():
             out.print(f"{name}  {port.path}")
         out.file.flush()
@@ -229,12 +232,7 @@ def emulate(scenario: Scenario_, seed: Seed = None, view: View = "off", sets: Se
         site = _scenario_path(scenario).parent / loaded.file.site
         err.print("In another terminal:")
         err.print(f"  companion run --site {site.resolve()} {options}")
-        with set_by_signals() as stop:
-            emulator.run(stop, lambda line: err.print(line))
-    finally:
-        emulator.close()
-        if shown is not None:
-            shown.close()
+        emulator.run(stop, lambda line: err.print(line))
 
 
 @app.command()

@@ -16,6 +16,8 @@ from companion.errors import UserError
 from companion.terminal import Seed, Sets, message_console, progress, result_console
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
     from companion.evaluation import Evaluation
 
 _TABLE_WIDTH = 100
@@ -76,7 +78,8 @@ def scenario(
             "--fault",
             metavar="KIND:KEY=VALUE,...",
             help="Put a fault into every trial (see companion edit --help); repeat it for several at once. "
-            "library: one evaluation for every sort of fault.",
+            "library: every sort of fault, each in trials of its own, against the same trials without; the "
+            "result is one table.",
         ),
     ] = None,
     sets: Sets = None,
@@ -90,7 +93,7 @@ def scenario(
     """
     from companion.config import named_file
     from companion.evaluation import DEFAULT_CHOICES, evaluate_scenario
-    from companion.evaluation_table import evaluation_notes, evaluation_table, leg_table, trust_table
+    from companion.fault_table import fault_table
     from companion.log_trial import LOG_SUFFIX
 
     out, err = result_console(), message_console()
@@ -103,10 +106,11 @@ def scenario(
         raise UserError(f"cannot write {json_file}: there is no folder {json_file.parent}")
     paths = [_imported(named_file(Path(source), "scenarios"), sets or []) for source in sources]
     results: list[Evaluation] = []
+    by_fault: dict[str, dict[str, Evaluation]] = {}
     for path, faults in _runs(paths, fault or [], sets or []):
         with progress(err, counts=True) as shown:
             count = 1 if path.suffix == LOG_SUFFIX and not faults else trials
-            bar = shown.add_task(path.stem, total=count)
+            bar = shown.add_task(" ".join([path.stem, *faults]), total=count)
             results.append(
                 evaluate_scenario(
                     path,
@@ -122,18 +126,21 @@ def scenario(
                 )
             )
         result = results[-1]
-        out.print(evaluation_table(result))
-        out.print(trust_table(result))
-        if (legs := leg_table(result)) is not None:
-            out.print(legs)
-        for line in evaluation_notes(result):
-            out.print(f"  {line}", soft_wrap=True)
+        if fault == ["library"]:
+            by_fault.setdefault(path.stem, {})[" ".join(faults)] = result
+        else:
+            _print(result, out)
         if folder is not None:
-            for line in _write_report(results, path, folder, sets or [], faults):
-                out.print(f"  {line}", soft_wrap=True)
+            lines = _write_report(results, by_fault, path, folder, sets or [], faults)
+            if not by_fault:
+                out.print("\n".join(f"  {line}" for line in lines), soft_wrap=True)
         if result.interrupted:
             err.print(f"[yellow]interrupted: {path} has {result.trials} of {count} trials[/]")
             break
+    for name, found in by_fault.items():
+        out.print(fault_table(name, found))
+    if by_fault and folder is not None:
+        out.print(f"  report, pictures and worst trials: {folder}", soft_wrap=True)
     if json_file is not None:
         figures = [result.to_json() for result in results]
         try:
@@ -143,6 +150,18 @@ def scenario(
             raise UserError(f"cannot write {json_file}: {error.strerror}") from error
     if results[-1].interrupted:
         raise typer.Exit(1)
+
+
+def _print(result: "Evaluation", out: "Console") -> None:
+    """Tables and notes of one evaluation."""
+    from companion.evaluation_table import evaluation_notes, evaluation_table, leg_table, trust_table
+
+    out.print(evaluation_table(result))
+    out.print(trust_table(result))
+    if (legs := leg_table(result)) is not None:
+        out.print(legs)
+    for line in evaluation_notes(result):
+        out.print(f"  {line}", soft_wrap=True)
 
 
 def _imported(path: Path, sets: list[str]) -> Path:
@@ -170,22 +189,29 @@ def _runs(paths: list[Path], faults: list[str], sets: list[str]) -> list[tuple[P
     for path in paths:
         is_log = path.suffix == LOG_SUFFIX
         config = log_config(path, sets) if is_log else load_scenario(path, None, sets).config
-        runs += [(path, [text]) for text in library(config)]
+        runs += [(path, []), *((path, [text]) for text in library(config))]
     return runs
 
 
 def _write_report(
-    results: "list[Evaluation]", path: Path, folder: Path, sets: list[str], faults: list[str]
+    results: "list[Evaluation]",
+    by_fault: "dict[str, dict[str, Evaluation]]",
+    path: Path,
+    folder: Path,
+    sets: list[str],
+    faults: list[str],
 ) -> list[str]:
     """Picture, worst trial and Markdown of the newest result, after those before; says what is there."""
     from companion.evaluation_plots import evaluation_figure
     from companion.evaluation_table import markdown
+    from companion.fault_table import fault_markdown
     from companion.worst_trial import write_worst_trial
 
     newest = results[-1]
     picture = folder / f"{newest.file_stem}.png"
     evaluation_figure(newest, picture)
-    text = "\n".join(markdown(result, [f"{result.file_stem}.png"]) for result in results)
+    text = "".join(fault_markdown(name, found) for name, found in by_fault.items())
+    text += "\n".join(markdown(result, [f"{result.file_stem}.png"]) for result in results)
     (folder / "report.md").write_text(text, encoding="utf-8")
     lines = [f"report   {folder / 'report.md'}", f"picture  {picture}"]
     log = write_worst_trial(newest, path, folder, sets, faults)

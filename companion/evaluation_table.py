@@ -24,7 +24,7 @@ _TRUST = (
     "beyond 3 sigma\n% of healthy",
 )
 
-_LEGS = "legs: RMSE / max [m]"
+_LEGS = "legs: RMSE / max m"
 
 
 def evaluation_table(result: Evaluation) -> Table:
@@ -50,8 +50,8 @@ def markdown(result: Evaluation, pictures: Sequence[str] = ()) -> str:
         tables.append((tuple(f"{name}, RMSE / max m" for name in legs), leg_rows(result)))
     for headings, rows in tables:
         cells = ["estimator", *(heading.replace("\n", " ").strip() for heading in headings)]
-        parts += [_line(cells), _line(["---", *["---:"] * len(headings)])]
-        parts += [_line([*row, *[""] * (len(cells) - len(row))]) for row in rows]
+        parts += [markdown_line(cells), markdown_line(["---", *["---:"] * len(headings)])]
+        parts += [markdown_line([*row, *[""] * (len(cells) - len(row))]) for row in rows]
         parts.append("")
     parts += [f"- {note}" for note in evaluation_notes(result)]
     parts += ["", *(f"![{result.scenario}]({name})" for name in pictures), ""]
@@ -184,7 +184,8 @@ def _table(title: str, headings: Sequence[str], rows: Sequence[Sequence[str]]) -
     return table
 
 
-def _line(cells: Sequence[str]) -> str:
+def markdown_line(cells: Sequence[str]) -> str:
+    """A row of a table."""
     return f"| {' | '.join(cells)} |"
 
 
@@ -192,7 +193,7 @@ def _cells(figures: MeanFigures) -> list[str]:
     low, high = figures.nees_bounds
     update = figures.update_us
     return [
-        *(_short(getattr(figures, key), 3) for key in _POSITION),
+        *(short(getattr(figures, key), 3) for key in _POSITION),
         "none" if figures.yaw_rmse_deg is None else f"{figures.yaw_rmse_deg:.1f}",
         f"{figures.nees:.1f} ({low:.1f}-{high:.1f})",
         f"{update.median:.0f}/{update.p99:.0f}",
@@ -207,7 +208,7 @@ def _trust_cells(figures: MeanFigures) -> list[str]:
         nis = f"{figures.nis:.2f} ({bounds[0]:.2f}-{bounds[1]:.2f})"
     return [
         _known(figures.epoch_bound_ratio, 2),
-        _short(figures.ate_m, 3),
+        short(figures.ate_m, 3),
         _known(figures.rpe_m, 3),
         _known(figures.rpe_deg, 2),
         nis,
@@ -219,22 +220,22 @@ def _trust_cells(figures: MeanFigures) -> list[str]:
 
 def _paper_cells(figures: PaperFigures) -> list[str]:
     stated = [getattr(figures, key, None) for key in _POSITION]
-    return ["" if value is None else _short(value, 3) for value in stated]
+    return ["" if value is None else short(value, 3) for value in stated]
 
 
 def _leg_cell(figures: LegFigures | PaperLeg | None) -> str:
     if figures is None or (figures.rmse_m is None and figures.max_m is None):
         return ""
-    return " / ".join("-" if v is None else _short(v, 3) for v in (figures.rmse_m, figures.max_m))
+    return " / ".join("-" if v is None else short(v, 3) for v in (figures.rmse_m, figures.max_m))
 
 
 _POSITION = ("rmse_m", "rmse_x_m", "rmse_y_m", "max_m", "max_x_m", "max_y_m")
 
 
 def _known(value: float | None, digits: int) -> str:
-    return "-" if value is None else _short(value, digits)
+    return "-" if value is None else short(value, digits)
 
 
-def _short(value: float, digits: int) -> str:
+def short(value: float, digits: int) -> str:
     """A number in few characters: what is large needs no decimals."""
     return f"{value:.{digits}f}" if value < 10.0 else f"{value:.1f}"

@@ -59,8 +59,8 @@ def sitl(
         err.print(f"[dim]{time.monotonic() - begin:8.1f}[/]  {escape(line)}")
 
     say(f"waiting for the autopilot on {connect}")
-    run = SitlRun(load_scenario(path, seed, sets or []), connect, folder, say)
     with set_by_signals() as stop:
+        run = SitlRun(load_scenario(path, seed, sets or []), connect, folder, say)
         if seconds is not None:
             timer = threading.Timer(seconds, stop.set)
             timer.daemon = True

@@ -1,6 +1,7 @@
 """Evaluation of logs, of several sources, on a cluster, and what is left of one that is interrupted."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from companion.errors import UserError
 from companion.evaluation import Evaluation, evaluate_scenario
 from companion.evaluation_plots import evaluation_figure
 from companion.evaluation_table import markdown
+from companion.fault_table import fault_markdown
 from companion.log import Log, LogWriter, RawChunk
 from companion.replay import config_of, replay
 from companion.trial_runner import run_trials
@@ -216,6 +218,36 @@ def test_the_command_takes_several_sources_and_writes_one_report(
         "short.png",
     }
     assert "…" not in done.stdout
+
+
+def test_all_faults_of_the_library_come_in_one_table_after_the_trials_without(
+    short_log: Path, tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    names = ["drop:anchor=1,at=1", "gone:at=2,for=1"]
+    monkeypatch.setattr("companion.log_edit.faults.library", lambda _: names)
+    done = command(
+        *("evaluate", short_log, "--trials", "1", "--workers", "1", "--estimators", "ekf"),
+        *("--fault", "library", "--out", tmp_path / "o", "--json", tmp_path / "f.json"),
+    )
+    assert done.returncode == 0, done.stderr
+    table = [line.split() for line in done.stdout.splitlines() if line.startswith("  ")]
+    table = table[2 : 3 + len(names)]
+    assert [row[0] for row in table] == ["none", *names]
+    figures = [each["estimators"]["ekf"] for each in json.loads((tmp_path / "f.json").read_text())]
+    shown = [(f"{each['rmse_m']:.3f}", f"{100 * each['integrity']:.2f}") for each in figures]
+    assert [(row[1], row[3]) for row in table] == shown
+    assert (tmp_path / "o" / "report.md").read_text().count("| ekf |") == 1 + 2 * len(figures)
+
+
+def test_what_one_would_not_fly_on_is_marked(result: Evaluation) -> None:
+    ekf = result.estimators["ekf"]
+    assert ekf is not None
+    bad = replace(result, estimators={**result.estimators, "ekf": replace(ekf, integrity=0.0123)})
+    good = replace(result, estimators={**result.estimators, "ekf": replace(ekf, integrity=0.01)})
+    text = fault_markdown("walk", {"": good, "gone:at=1": bad})
+    assert f"| gone:at=1 | {ekf.rmse_m:.3f} / -" not in text
+    assert f"**{ekf.rmse_m:.3f} / 1.23**" in text
+    assert f"| {ekf.rmse_m:.3f} / 1.00 |" in text
 
 
 def test_a_site_that_is_no_scenario_is_refused(command: Command) -> None:

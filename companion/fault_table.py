@@ -1,0 +1,65 @@
+"""What faults do to estimators, in one table: a row for each fault, the trials without one first."""
+
+from collections.abc import Mapping
+
+from rich import box
+from rich.table import Table
+
+from companion.evaluation import Evaluation, MeanFigures
+from companion.evaluation_table import markdown_line, short
+
+MOST_BEYOND = 0.01
+"""Share of the poses sent that may be beyond 3 sigma; more is marked."""
+
+
+def fault_table(name: str, results: Mapping[str, Evaluation]) -> Table:
+    """Errors and integrity by fault and estimator.
+
+    Args:
+        name: of scenario or log.
+        results: fault, "" for none -> its evaluation.
+    """
+    table = Table(title=_title(name, results), title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1))
+    table.add_column("fault", no_wrap=True)
+    for heading in _headings(results):
+        table.add_column(heading, justify="right", no_wrap=True)
+    for fault, result in results.items():
+        cells = (
+            f"[bold red]{_cell(each)}[/]" if _is_bad(each) else _cell(each)
+            for each in result.estimators.values()
+        )
+        table.add_row(fault or "none", *cells)
+    return table
+
+
+def fault_markdown(name: str, results: Mapping[str, Evaluation]) -> str:
+    """The same as a section of Markdown, with what is marked in bold."""
+    headings = ["fault", *_headings(results)]
+    lines = [f"## {_title(name, results)}", "", markdown_line(headings)]
+    lines.append(markdown_line(["---", *["---:"] * (len(headings) - 1)]))
+    for fault, result in results.items():
+        cells = (
+            f"**{_cell(each)}**" if _is_bad(each) else _cell(each) for each in result.estimators.values()
+        )
+        lines.append(markdown_line([fault or "none", *cells]))
+    return "\n".join([*lines, "", ""])
+
+
+def _title(name: str, results: Mapping[str, Evaluation]) -> str:
+    trials = max(result.trials for result in results.values())
+    return f"{name}, {trials} trials a fault: RMSE m / healthy poses beyond 3 sigma, %"
+
+
+def _headings(results: Mapping[str, Evaluation]) -> list[str]:
+    return list(next(iter(results.values())).estimators)
+
+
+def _cell(figures: MeanFigures | None) -> str:
+    if figures is None:
+        return "none"
+    beyond = "-" if figures.integrity is None else f"{100 * figures.integrity:.2f}"
+    return f"{short(figures.rmse_m, 3)} / {beyond}"
+
+
+def _is_bad(figures: MeanFigures | None) -> bool:
+    return figures is not None and figures.integrity is not None and figures.integrity > MOST_BEYOND
