@@ -8,7 +8,9 @@ replay of the log asks for exactly the poses that the live run gave.
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
+
+import numpy as np
 
 from companion.config import Config, HealthTable
 from companion.health import AnchorState, Health, HealthMonitor
@@ -25,8 +27,18 @@ from estimators.base import Estimator, Report, Sketch, Sketched, Verdict, taken_
 from estimators.lidar.front_ends import ScanFrontEnd, make_scan_front_end
 from estimators.lidar.fused_odometry import FusedOdometry
 from estimators.lidar.scan_matching import ScanMatcher
-from estimators.messages import LoopClosure, Measurement, PoseEstimate, PoseIncrement, RangeFrame, Scan
+from estimators.messages import (
+    FloatArray,
+    LoopClosure,
+    Measurement,
+    PoseEstimate,
+    PoseIncrement,
+    RangeFrame,
+    Scan,
+)
 from estimators.models.range_bias import without_bias
+
+_NO_LANDMARKS = np.empty((0, 2))
 
 
 class FrontEnd(Protocol):
@@ -34,6 +46,16 @@ class FrontEnd(Protocol):
 
     def update(self, measurement: Measurement) -> PoseIncrement | None:
         """Increment up to the time of the measurement; None when it gives none."""
+        ...
+
+
+@runtime_checkable
+class Landmarked(Protocol):
+    """A front end that can show what it knows the room by."""
+
+    @property
+    def landmarks(self) -> FloatArray:
+        """(N, 2) [m] corners and poles, in the body frame at the end of the newest scan."""
         ...
 
 
@@ -63,6 +85,7 @@ class Tick:
         poses: estimator name -> pose at `stamp_ns`, None while it has none.
         health: judgement of the primary estimator's pose.
         sketches: estimator -> what it holds besides; empty unless somebody watches.
+        landmarks: (N, 2) [m] of the front end, as seen at the end of the newest scan; empty likewise.
     """
 
     stamp_ns: int
@@ -70,6 +93,7 @@ class Tick:
     poses: dict[str, PoseEstimate | None]
     health: Health
     sketches: dict[str, Sketch] = field(default_factory=dict)
+    landmarks: FloatArray = field(default_factory=lambda: _NO_LANDMARKS)
 
 
 class Pipeline:
@@ -121,6 +145,10 @@ class Pipeline:
         """What estimators hold besides their poses, of those that can show it."""
         shown = {name: e.sketch() for name, e in self._estimators.items() if isinstance(e, Sketched)}
         return {name: sketch for name, sketch in shown.items() if sketch is not None}
+
+    def landmarks(self) -> FloatArray:
+        """(N, 2) [m] of the front end, in the body frame at the end of the newest scan."""
+        return self._front_end.landmarks if isinstance(self._front_end, Landmarked) else _NO_LANDMARKS
 
     def _update(self, measurement: Measurement) -> Outcome:
         kind = type(measurement)
@@ -212,7 +240,10 @@ class Chain:
                 outcomes.append(outcome)
         poses = self._pipeline.poses_at(stamp_ns)
         health = self._monitor.judge(poses[self._primary], stamp_ns)
-        return Tick(stamp_ns, outcomes, poses, health, self._pipeline.sketches() if self._watched else {})
+        if not self._watched:
+            return Tick(stamp_ns, outcomes, poses, health)
+        held = self._pipeline.sketches(), self._pipeline.landmarks()
+        return Tick(stamp_ns, outcomes, poses, health, *held)
 
 
 def make_sensors(config: Config) -> dict[str, Sensor]:

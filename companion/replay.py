@@ -9,6 +9,7 @@ from math import isinf
 from pathlib import Path
 from statistics import fmean
 
+import numpy as np
 from scipy.spatial.transform import Rotation
 
 from companion import __version__
@@ -16,11 +17,11 @@ from companion.config import Config, config_from_toml
 from companion.errors import UserError
 from companion.evaluate import Accuracy, Errors, Reference, compare
 from companion.log import Log, RawChunk, Truth
-from companion.pipeline import Chain, FrontEnd, Pipeline, Tick, make_parts
+from companion.pipeline import Chain, FrontEnd, Landmarked, Pipeline, Tick, make_parts
 from companion.range_log import HEADER, range_lines
 from drivers.framing import DecodeStats
 from estimators.base import Estimator, Report, Sketch, Sketched, Taken, Verdict, taken_by
-from estimators.messages import Measurement, PoseEstimate, PoseIncrement, RangeFrame, Scan
+from estimators.messages import FloatArray, Measurement, PoseEstimate, PoseIncrement, RangeFrame, Scan
 
 
 @dataclass(slots=True)
@@ -82,6 +83,11 @@ class _TimedFrontEnd:
         if isinstance(measurement, Scan):
             self._stopwatch.note(begin)
         return increment
+
+    @property
+    def landmarks(self) -> FloatArray:
+        """Of the front end, if it has any."""
+        return self._front_end.landmarks if isinstance(self._front_end, Landmarked) else np.empty((0, 2))
 
 
 @dataclass(slots=True)

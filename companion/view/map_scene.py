@@ -15,6 +15,7 @@ from companion.view.anchor_marks import AnchorMarks
 from companion.view.batch import Batch
 from companion.view.closures import send_closures
 from companion.view.entities import Entities
+from companion.view.landmarks import send_landmarks
 from companion.view.palette import (
     GREY,
     LIGHT,
@@ -82,6 +83,7 @@ class MapScene:
         self._send_covariance(batch)
         self._send_truth(batch)
         self._send_scans(batch)
+        send_landmarks(self._entities, batch)
         if batch.frames:
             self._send_ranges(batch)
         self._anchors.send(batch)

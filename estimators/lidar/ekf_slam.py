@@ -92,6 +92,15 @@ class EkfSlam:
         self.refused = 0
         """Scans in which too little was known again, so that tracking began anew."""
 
+    @property
+    def landmarks(self) -> FloatArray:
+        """(N, 2) [m] corners and poles that it believes in, in the body frame at the end of the newest scan."""
+        here = self.map
+        if here is None:
+            return np.empty((0, 2))
+        believed = (here.kinds != Kind.WALL) & (here.sightings >= TRIED)
+        return transform(inverse(here.pose), here.features[believed])
+
     def update(self, measurement: Measurement) -> PoseIncrement | None:
         """Take a scan through the four stages; of other measurements, remember what the preparation needs.
 
