@@ -9,7 +9,7 @@ from companion.replay import config_of, replay
 from companion.view.files import RerunFiles
 from tests.companion.view.recordings import Recording, read
 
-COLUMN = np.array([[-0.3, -0.3], [0.3, -0.3], [0.3, 0.3], [-0.3, 0.3]]) + [4.0, 3.6]
+CORNERS = np.array([[3.7, 3.3], [4.3, 3.3], [4.3, 3.9], [3.7, 3.9]])
 
 
 def shown(log: Log, path: Path, front_end: str) -> Recording:
@@ -24,7 +24,7 @@ def test_corners_are_drawn_where_they_are(short_log: Path, tmp_path: Path) -> No
     landmarks = shown(Log(short_log), tmp_path / "run.rrd", "ekf_slam")["map/landmarks"]
     clouds = [np.array(rows) for rows in landmarks["Points2D:positions"] if rows]
     assert len(clouds) > 10
-    nearest = np.linalg.norm(np.vstack(clouds)[:, None] - COLUMN, axis=2).min(axis=1)
+    nearest = np.linalg.norm(np.vstack(clouds)[:, None] - CORNERS, axis=2).min(axis=1)
     assert nearest.max() < 0.2
 
 
