@@ -33,6 +33,7 @@ from estimators.bounds import (
     position_information,
     posterior_bound,
     range_information,
+    seen_from,
 )
 from estimators.geometry import transform_each
 from estimators.lidar.dead_reckoning import DeadReckoning
@@ -269,29 +270,35 @@ def note_poses(now: Mapping[str, PoseEstimate | None], poses: Mapping[str, list[
 def _bound(scenario: Scenario, setup: Setup, walk: MeasuredWalk) -> float | None:
     """Root mean square over the walk of the least position error [m]; blocked ranges do not count.
 
-    None when ranges or landmarks are measured between the steps, where no increment tells the motion,
-    without noise, and where the start is unknown or the robot is carried off.
+    What is measured between two steps counts at the later one, as if the motion in between were known: that
+    can only lower the bound. None where no increment tells the motion, without noise, and where the start is
+    unknown or the robot is carried off.
     """
-    if scenario.file.kidnap or not setup.start.known:
-        return None
-    step_of = {stamp_ns: k for k, stamp_ns in enumerate(walk.stamps_ns.tolist())}
-    measured_at = {frame.stamp_ns for frame in walk.range_frames}
-    measured_at |= {look.stamp_ns for look in walk.landmark_frames}
     sigma = scenario.file.uwb.sigma
-    if sigma == 0.0 or not measured_at <= step_of.keys():
+    if scenario.file.kidnap or not setup.start.known or sigma == 0.0:
         return None
     information = np.zeros((len(walk.poses), 3, 3))
+
+    def count(stamp_ns: int, pose: FloatArray, seen: FloatArray) -> None:
+        k = int(np.searchsorted(walk.stamps_ns, stamp_ns))
+        if k < len(walk.poses):
+            information[k] += seen_from(walk.poses[k], pose, seen)
+
     for frame, unblocked in zip(walk.range_frames, walk.unblocked, strict=True):
-        k = step_of[frame.stamp_ns]
-        information[k] += range_information(walk.poses[k], setup, unblocked, sigma)
+        pose = _true_pose(scenario, frame.stamp_ns)
+        count(frame.stamp_ns, pose, range_information(pose, setup, unblocked, sigma))
     for look in walk.landmark_frames:
-        k = step_of[look.stamp_ns]
-        information[k] += landmark_information(
-            walk.poses[k], setup, look.landmark_ids.tolist(), look.range_sigma, look.bearing_sigma
-        )
+        pose, ids = _true_pose(scenario, look.stamp_ns), look.landmark_ids.tolist()
+        seen = landmark_information(pose, setup, ids, look.range_sigma, look.bearing_sigma)
+        count(look.stamp_ns, pose, seen)
     increment_covs = [increment.cov for increment in walk.increments[1:]]
     bounds = posterior_bound(np.diag(setup.start.sigma**2), walk.poses, increment_covs, information)
     return float(np.sqrt((bounds[:, 0, 0] + bounds[:, 1, 1]).mean()))
+
+
+def _true_pose(scenario: Scenario, stamp_ns: int) -> FloatArray:
+    pose: FloatArray = scenario.trajectory.at(np.array([(stamp_ns - START_NS) * 1e-9])).pose[0]
+    return pose
 
 
 def _epoch_bound(scenario: Scenario, setup: Setup, poses: FloatArray) -> float | None:

@@ -67,6 +67,23 @@ def range_information(pose: FloatArray, setup: Setup, anchor_ids: Iterable[int],
     return information
 
 
+def seen_from(pose: FloatArray, other: FloatArray, information: FloatArray) -> FloatArray:
+    """What tells of one pose as information on another, the motion between the two being known.
+
+    Args:
+        pose: (3,) true x [m], y [m], yaw [rad] that is asked for, map frame.
+        other: (3,) true pose that the information is on.
+        information: (3, 3) on (x, y, yaw) of the other.
+
+    Returns:
+        (3, 3) on (x, y, yaw) of the first.
+    """
+    dx, dy = other[:2] - pose[:2]
+    by_pose = np.array([[1.0, 0.0, -dy], [0.0, 1.0, dx], [0.0, 0.0, 1.0]])
+    shifted: FloatArray = by_pose.T @ information @ by_pose
+    return shifted
+
+
 def position_information(
     points: FloatArray, anchors: FloatArray, counts: NDArray[np.bool_], sigma: float
 ) -> FloatArray:

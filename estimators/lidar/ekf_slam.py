@@ -94,7 +94,7 @@ class EkfSlam:
 
     @property
     def landmarks(self) -> FloatArray:
-        """(N, 2) [m] corners and poles that it believes in, in the body frame at the end of the newest scan."""
+        """(N, 2) [m] believed corners and poles, in the body frame at the end of the newest scan."""
         here = self.map
         if here is None:
             return np.empty((0, 2))

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from estimators.bounds import landmark_information, posterior_bound, range_information
+from estimators.bounds import landmark_information, posterior_bound, range_information, seen_from
 from estimators.geometry import between, compose, wrap_angle
 from estimators.messages import FloatArray
 from estimators.models.motion import increment
@@ -120,6 +120,17 @@ def test_range_information_is_the_square_of_the_slant_gradient() -> None:
         H = numerical_jacobian(lambda at: np.array([slant(at, i) for i in IDS[:2]]), pose)
         information = range_information(pose, SETUP, IDS[:2], SIGMA)
         np.testing.assert_allclose(information, H.T @ H / SIGMA**2, rtol=1e-5, atol=1e-6)
+
+
+def test_information_on_one_pose_tells_of_another_a_known_way_off() -> None:
+    pose, way = np.array([2.0, 1.5, 0.4]), np.array([0.7, -0.3, 0.5])
+    step = 1e-6
+    shifted = [compose(pose + step * axis, way) - compose(pose - step * axis, way) for axis in np.eye(3)]
+    by_pose = np.column_stack(shifted) / (2.0 * step)
+    there = compose(pose, way)
+    information = range_information(there, SETUP, IDS[:2], SIGMA)
+    expected = by_pose.T @ information @ by_pose
+    assert seen_from(pose, there, information) == pytest.approx(expected, rel=1e-6)
 
 
 def test_landmark_information_counts_range_and_bearing() -> None:
