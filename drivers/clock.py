@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from estimators.messages import FloatArray, IntArray
+from estimators.messages import IntArray
 
 _MS = 1_000_000
 _BLOCK_NS = 250 * _MS  # one least delay is kept for each
@@ -147,23 +147,25 @@ class DeviceClock:
 
     def _fit(self) -> None:
         """The line that touches the delays from below and is nearest to them on average."""
-        points = np.array(self._blocks) - self._blocks[-1]  # exact: integers before they become floats
-        at, delay = points[:, 0].astype(np.float64), points[:, 1].astype(np.float64)
-        self._drift = float(np.clip(_slope_below(at, delay), -_MAX_DRIFT, _MAX_DRIFT))
-        touching = int(np.argmin(delay - self._drift * at))
-        self._line = self._blocks[touching]
+        last_ns, last_delay_ns = self._blocks[-1]
+        # exact: integers before they become floats
+        points = [(float(at - last_ns), float(delay - last_delay_ns)) for at, delay in self._blocks]
+        self._drift = min(max(_slope_below(points), -_MAX_DRIFT), _MAX_DRIFT)
+        above = [delay - self._drift * at for at, delay in points]
+        self._line = self._blocks[above.index(min(above))]
 
 
-def _slope_below(x: FloatArray, y: FloatArray) -> float:
-    """Slope of the lower convex hull where it passes the mean of x; x ascending, N >= 2."""
-    middle = x.mean()
+def _slope_below(points: list[tuple[float, float]]) -> float:
+    """Slope of the lower convex hull of (x, y) where it passes the mean of x; x ascending, N >= 2."""
+    middle = sum(x for x, _ in points) / len(points)
     hull: list[tuple[float, float]] = []
-    for x2, y2 in zip(x.tolist(), y.tolist(), strict=True):  # plain floats: few points, much arithmetic
+    for x2, y2 in points:
         while len(hull) >= 2:
-            (x0, y0), (x1, y1) = hull[-2:]
+            x0, y0 = hull[-2]
+            x1, y1 = hull[-1]
             if (y1 - y0) * (x2 - x0) < (y2 - y0) * (x1 - x0):
                 break
             hull.pop()
         hull.append((x2, y2))
     (x0, y0), (x1, y1) = next(edge for edge in pairwise(hull) if edge[1][0] >= middle)
-    return float((y1 - y0) / (x1 - x0))
+    return (y1 - y0) / (x1 - x0)

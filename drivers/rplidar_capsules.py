@@ -145,7 +145,7 @@ class CapsuleBatch:
         return len(self._angles_q6)
 
     def add(self, packet: bytes, following: bytes, angle_q6: int, step_q16: int) -> None:
-        """Append a packet that follows those that are there, and begins at this angle and goes by this step."""
+        """Append a packet that follows those that are there: its first angle, its step."""
         self._packets[-1:] = (packet, following)
         self._angles_q6.append(angle_q6)
         self._steps_q16.append(step_q16)
@@ -184,7 +184,11 @@ class ExpressCapsules(Capsules):
     SAMPLES = 32
     _SLOWEST_SAMPLE_US = 500
 
-    def measure(self, packets: ByteArray, before_q2: int) -> tuple[IntArray, IntArray, IntArray | None]:
+    def measure(
+        self,
+        packets: ByteArray,
+        before_q2: int,  # noqa: ARG002
+    ) -> tuple[IntArray, IntArray, IntArray | None]:
         """See `Capsules`."""
         cabins = packets[:-1, _BODY:].copy().view(_EXPRESS_CABIN).ravel()
         words = cabins["words"].astype(np.int64)
@@ -200,7 +204,11 @@ class DenseCapsules(Capsules):
     SAMPLES = 40
     _SLOWEST_SAMPLE_US = 250
 
-    def measure(self, packets: ByteArray, before_q2: int) -> tuple[IntArray, IntArray, IntArray | None]:
+    def measure(
+        self,
+        packets: ByteArray,
+        before_q2: int,  # noqa: ARG002
+    ) -> tuple[IntArray, IntArray, IntArray | None]:
         """See `Capsules`."""
         words: IntArray = packets[:-1, _BODY:].copy().view("<u2").astype(np.int64)
         distance_q2 = words.ravel() << 2

@@ -34,22 +34,22 @@ class PackedLine(NamedTuple):
     Attributes:
         before_ns: time of the sample before.
         before: how many had been taken with that one.
-        count: how many are spread.
+        samples: how many are spread.
         span_ns: from the sample before to the last of these, if there were no others.
     """
 
     before_ns: int
     before: int
-    count: int
+    samples: int
     span_ns: int
 
     def host_ns(self, ticks: int) -> int:
         """See `TimeLine`."""
-        return self.before_ns + (ticks - self.before) * max(self.count, self.span_ns) // self.count
+        return self.before_ns + (ticks - self.before) * max(self.samples, self.span_ns) // self.samples
 
     def host_times(self, ticks: IntArray) -> IntArray:
         """See `TimeLine`."""
-        return self.before_ns + (ticks - self.before) * max(self.count, self.span_ns) // self.count
+        return self.before_ns + (ticks - self.before) * max(self.samples, self.span_ns) // self.samples
 
 
 class Revolution:
@@ -97,13 +97,12 @@ class Revolution:
         angle_q14, distance_q2, quality = map(np.concatenate, zip(*parts, strict=True))
         times = [line.host_times(np.arange(first + 1, end + 1)) for line, first, end in self._times]
         times_ns = np.concatenate(times)
-        # clockwise in 65536 parts of a turn -> counter-clockwise in [-pi, pi)
-        half_turns = ((32768 - angle_q14) % 65536 - 32768) / 32768
         ranges = distance_q2 / 4000
         ranges[(ranges < min_range) | (ranges > max_range)] = 0.0
         return Scan(
             stamp_ns=int(times_ns[0]),
-            angles=half_turns * np.pi,
+            # clockwise in 65536 parts of a turn -> counter-clockwise in [-pi, pi), as 16 bits wrap
+            angles=(-angle_q14).astype(np.int16) * np.float64(np.pi / 32768),
             ranges=ranges,
             beam_times=(times_ns - times_ns[0]) * 1e-9,
             quality=quality.astype(np.float64) if self._has_quality else np.zeros(len(times_ns)),

@@ -43,7 +43,11 @@ class UltraCapsules(Capsules):
     SAMPLES = 96
     _SLOWEST_SAMPLE_US = 200
 
-    def measure(self, packets: ByteArray, before_q2: int) -> tuple[IntArray, IntArray, IntArray | None]:
+    def measure(
+        self,
+        packets: ByteArray,
+        before_q2: int,  # noqa: ARG002
+    ) -> tuple[IntArray, IntArray, IntArray | None]:
         """See `Capsules`."""
         words = packets[:, _ULTRA_BODY:].copy().view("<i4").ravel()
         words = words[: (len(packets) - 1) * _ULTRA_WORDS + 1].astype(np.int64)

@@ -39,10 +39,10 @@ rngs = st.integers(0, 2**32).map(random.Random)
 
 def nodes(events: Iterable[Event]) -> list[Node]:
     return [
-        (*map(int, values), int(i in event.starts))
+        (int(angle), int(distance), int(quality), int(i in event.starts))
         for event in events
         if isinstance(event, Samples)
-        for i, values in enumerate(zip(*event.columns, strict=True))
+        for i, (angle, distance, quality) in enumerate(zip(*event.columns, strict=True))
     ]
 
 
