@@ -9,13 +9,16 @@ import pytest
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
+from drivers.framing import DecodeStats
 from drivers.rplidar_capsules import encode_dense_capsule, encode_express_capsule, framed, start_word
+from drivers.rplidar_decoder import AnswerDecoder
 from drivers.rplidar_nodes import TURN_Q6, encode_hq_packet, encode_standard_node
-from drivers.rplidar_protocol import PACKET_SAMPLES, AnswerType, Samples, encode_descriptor
+from drivers.rplidar_protocol import PACKET_SAMPLES, AnswerType, Event, Samples, encode_descriptor
 from drivers.rplidar_ultra import encode_ultra_capsule, encode_ultra_dense_capsule, ultra_offset_q16
 from estimators.messages import FloatArray
 from tests import vectors
-from tests.drivers.rplidar_samples import CAPSULES, Node, feed, nodes, packets
+from tests.drivers.rplidar_samples import CAPSULES, Node, feed, nodes, packets, rngs
+from tests.fuzz.well_formed import held_bytes
 
 angles_q6 = st.integers(0, TURN_Q6 - 1)
 spans_q6 = st.integers(1, 45 * 64)
@@ -244,6 +247,41 @@ def test_near_targets_of_ultra_dense_are_smoothed_as_in_the_sdk(
     for chunks in (sent, [b"".join(sent)]):
         events = feed([encode_descriptor(AnswerType.ULTRA_DENSE_SCAN), *chunks])
         assert [q2 for _, q2, _, _ in nodes(events)] == expected
+
+
+@pytest.mark.parametrize("scan_type", CAPSULES)
+@given(rng=rngs)
+def test_when_samples_are_asked_for_does_not_matter(scan_type: AnswerType, rng: random.Random) -> None:
+    if scan_type is AnswerType.ULTRA_DENSE_SCAN:  # so near each other that each depends on the one before
+        near_mm = [[rng.randint(998, 1002) for _ in range(64)] for _ in range(12)]
+        sent = [
+            encode_ultra_dense_capsule(1000 * i, False, distances_mm, [7] * 64, 0)
+            for i, distances_mm in enumerate(near_mm)
+        ]
+    else:
+        sent = packets(scan_type, range(100, 12_000, 1000), rng, first_flag=False)
+    lost = rng.randrange(1, 11)
+    sent[lost : lost + rng.choice((0, 0, 8))] = []  # so many that there is a gap
+    sent.insert(0, encode_descriptor(scan_type))
+    decoder, events = AnswerDecoder(DecodeStats()), list[Event]()
+    for packet in sent:
+        events += decoder.feed(packet)
+        if rng.random() < 0.4:
+            nodes([rng.choice(events)])
+    for event in rng.sample(events, len(events)):
+        nodes([event])
+    assert nodes(events) == nodes(feed([b"".join(sent)]))
+
+
+@pytest.mark.parametrize("scan_type", CAPSULES)
+def test_packets_that_nobody_asks_for_do_not_pile_up(scan_type: AnswerType) -> None:
+    sent = packets(scan_type, range(0, 1_000_000, 1000), random.Random(0), first_flag=False)
+    decoder = AnswerDecoder(DecodeStats())
+    last = feed([encode_descriptor(scan_type), *sent])[-1]
+    decoder.feed(encode_descriptor(scan_type))
+    events = [decoder.feed(packet) for packet in sent][-1]
+    assert held_bytes(decoder) < 250_000
+    assert nodes(events) == nodes([last])
 
 
 def test_smoothing_does_not_reach_across_a_gap() -> None:
