@@ -18,7 +18,6 @@ from drivers.autopilot_odometry import OdometryConfig, OdometryInput
 from drivers.mavlink_frames import AutopilotIdentity, MavlinkMessage, MavlinkParser
 from estimators.messages import Attitude, FloatArray, Height, ImuSample, Measurement, PoseIncrement
 
-_FLU_FRD = np.array([1.0, -1.0, -1.0])
 _MILLI_G = 9.80665e-3
 _MS, _US = 1_000_000, 1000
 _IMU_RANKS = {"SCALED_IMU": 0, "RAW_IMU": 1, "HIGHRES_IMU": 2}
@@ -126,14 +125,14 @@ class Autopilot:
             return None
         self._imu_rank = rank
         boot_ns = message.time_boot_ms * _MS if kind == "SCALED_IMU" else message.time_usec * _US
-        gyro = np.array([message.xgyro, message.ygyro, message.zgyro], dtype=np.float64)
-        accel = np.array([message.xacc, message.yacc, message.zacc], dtype=np.float64)
-        if kind != "HIGHRES_IMU":
-            gyro, accel = gyro * 1e-3, accel * _MILLI_G
+        rate, force = (1.0, 1.0) if kind == "HIGHRES_IMU" else (1e-3, _MILLI_G)
+        p, q, r = message.xgyro * rate, message.ygyro * rate, message.zgyro * rate
+        x, y, z = message.xacc * force, message.yacc * force, message.zacc * force
         stamp_ns = self._host_ns(boot_ns, arrival_ns)
-        if not (_is_finite(gyro) and _is_finite(accel)):
+        # The sum of float32 is finite when each of them is.
+        if not isfinite(p + q + r + x + y + z):
             return None
-        return ImuSample(stamp_ns, gyro * _FLU_FRD, accel * _FLU_FRD)
+        return ImuSample(stamp_ns, np.array((p, -q, -r)), np.array((x, -y, -z)))
 
     def _distance(self, message: MavlinkMessage, arrival_ns: int) -> Height | None:
         if message.orientation != _DOWN:

@@ -11,10 +11,11 @@ Delay Measurements", INFOCOM 1999.
 
 from collections import deque
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
-from estimators.messages import FloatArray, IntArray
+from estimators.messages import IntArray
 
 _MS = 1_000_000
 _BLOCK_NS = 250 * _MS  # one least delay is kept for each
@@ -23,6 +24,36 @@ _LEAST_SPAN_NS = 1000 * _MS  # before that the drift would be guessed from jitte
 _MAX_DRIFT = 0.02  # of a sample duration that a device rounds or a driver had to assume
 _MAX_STEP_NS = 500 * _MS  # a delay that changes by more is another clock, or the same one set anew
 _MAX_LATE_NS = 1000 * _MS  # how long every arrival may be that late before this is believed
+
+
+class ClockLine(NamedTuple):
+    """Host times of a device's counter, on a line.
+
+    Attributes:
+        zero_ns: device time of the reading 0.
+        tick_ns: from one reading to the next.
+        at_ns: device time of one point on the line.
+        delay_ns: host time less device time there.
+        drift: by which that rises with device time.
+    """
+
+    zero_ns: int
+    tick_ns: int
+    at_ns: int
+    delay_ns: int
+    drift: float
+
+    def host_ns(self, ticks: int) -> int:
+        """Host time at which the counter had this value."""
+        device_ns = self.zero_ns + ticks * self.tick_ns
+        return device_ns + self.delay_ns + round(self.drift * (device_ns - self.at_ns))
+
+    def host_times(self, ticks: IntArray) -> IntArray:
+        """Host times [ns] of several readings, (N,); the same as those of each."""
+        device_ns = self.zero_ns + ticks * self.tick_ns
+        times: IntArray = device_ns + self.delay_ns
+        times += np.rint(self.drift * (device_ns - self.at_ns)).astype(np.int64)
+        return times
 
 
 class DeviceClock:
@@ -79,17 +110,12 @@ class DeviceClock:
             self._add(device_ns, delay_ns)
         self._last_ticks = ticks
 
-    def host_ns(self, ticks: int) -> int:
-        """Host time at which the counter had this value; it must be near the last one observed."""
-        return int(self.host_times(np.array([ticks]))[0])
-
-    def host_times(self, ticks: IntArray) -> IntArray:
-        """Host times [ns] of several readings near the last one observed, (N,)."""
+    @property
+    def line(self) -> ClockLine:
+        """Host times of readings near the last one observed."""
         assert self._last_ticks is not None, "no reading was observed yet"
-        device_ns = self._device_ns + (ticks - self._last_ticks) * self._tick_ns
-        since_ns = device_ns - self._line[0]
-        times: IntArray = device_ns + self._line[1] + np.rint(self._drift * since_ns).astype(np.int64)
-        return times
+        zero_ns = self._device_ns - self._last_ticks * self._tick_ns
+        return ClockLine(zero_ns, self._tick_ns, *self._line, self._drift)
 
     def stamp(self, ticks: int, arrival_ns: int) -> int:
         """Host time of one reading; never falls from one call to the next and never exceeds the arrival.
@@ -121,23 +147,25 @@ class DeviceClock:
 
     def _fit(self) -> None:
         """The line that touches the delays from below and is nearest to them on average."""
-        points = np.array(self._blocks) - self._blocks[-1]  # exact: integers before they become floats
-        at, delay = points[:, 0].astype(np.float64), points[:, 1].astype(np.float64)
-        self._drift = float(np.clip(_slope_below(at, delay), -_MAX_DRIFT, _MAX_DRIFT))
-        touching = int(np.argmin(delay - self._drift * at))
-        self._line = self._blocks[touching]
+        last_ns, last_delay_ns = self._blocks[-1]
+        # exact: integers before they become floats
+        points = [(float(at - last_ns), float(delay - last_delay_ns)) for at, delay in self._blocks]
+        self._drift = min(max(_slope_below(points), -_MAX_DRIFT), _MAX_DRIFT)
+        above = [delay - self._drift * at for at, delay in points]
+        self._line = self._blocks[above.index(min(above))]
 
 
-def _slope_below(x: FloatArray, y: FloatArray) -> float:
-    """Slope of the lower convex hull where it passes the mean of x; x ascending, N >= 2."""
-    middle = x.mean()
+def _slope_below(points: list[tuple[float, float]]) -> float:
+    """Slope of the lower convex hull of (x, y) where it passes the mean of x; x ascending, N >= 2."""
+    middle = sum(x for x, _ in points) / len(points)
     hull: list[tuple[float, float]] = []
-    for x2, y2 in zip(x.tolist(), y.tolist(), strict=True):  # plain floats: few points, much arithmetic
+    for x2, y2 in points:
         while len(hull) >= 2:
-            (x0, y0), (x1, y1) = hull[-2:]
+            x0, y0 = hull[-2]
+            x1, y1 = hull[-1]
             if (y1 - y0) * (x2 - x0) < (y2 - y0) * (x1 - x0):
                 break
             hull.pop()
         hull.append((x2, y2))
     (x0, y0), (x1, y1) = next(edge for edge in pairwise(hull) if edge[1][0] >= middle)
-    return float((y1 - y0) / (x1 - x0))
+    return (y1 - y0) / (x1 - x0)

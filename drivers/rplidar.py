@@ -4,9 +4,8 @@ Source: Slamtec interface protocol rev 2.2; rplidar_sdk @99478e5.
 """
 
 from itertools import pairwise
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
-import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from drivers.framing import DecodeStats
@@ -26,7 +25,8 @@ from drivers.rplidar_protocol import (
     Samples,
     ScanStarted,
 )
-from estimators.messages import IntArray, Measurement, Scan
+from drivers.rplidar_revolution import PackedLine, Revolution, TimeLine
+from estimators.messages import Measurement, Scan
 
 _DEFAULT_SAMPLE_NS = {  # where the device was not asked or did not say (protocol figure 3-3)
     AnswerType.STANDARD_SCAN: 500_000,
@@ -37,60 +37,8 @@ _DEFAULT_SAMPLE_NS = {  # where the device was not asked or did not say (protoco
     AnswerType.HQ_SCAN: 125_000,
 }
 _WITH_QUALITY = (AnswerType.STANDARD_SCAN, AnswerType.ULTRA_DENSE_SCAN, AnswerType.HQ_SCAN)
-_MIN_SAMPLES = 30  # fewer are not a revolution
-_MAX_REVOLUTION_NS = 1_000_000_000  # slower than any of these devices turns
 _ANSWER_START = b"\xa5\x5a"
 _PAUSE_NS = 50_000_000  # packets follow each other sooner, answers after a STOP do not
-
-
-class _Part(NamedTuple):
-    """Consecutive samples, (n,) each."""
-
-    angle_q14: IntArray
-    distance_q2: IntArray
-    quality: IntArray
-    times_ns: IntArray
-
-    def cut(self, first: int, end: int) -> "_Part":
-        """Those from the first up to the end."""
-        return _Part(*(column[first:end] for column in self))
-
-
-class _Revolution:
-    """Samples since the last start of a revolution; knows whether they may become a `Scan`."""
-
-    def __init__(self) -> None:
-        self._parts: list[_Part] = []
-        self._intact = True
-
-    def add(self, part: "_Part") -> None:
-        """Append samples."""
-        if self._intact and len(part.times_ns):
-            self._parts.append(part)
-            if part.times_ns[-1] - self._parts[0].times_ns[0] > _MAX_REVOLUTION_NS:
-                self.spoil()
-
-    def spoil(self) -> None:
-        """It has a gap or takes too long: give up, and keep nothing more of it."""
-        self._intact = False
-        self._parts.clear()
-
-    def scan(self, min_range: float, max_range: float) -> Scan | None:
-        """The finished revolution; None when it is spoilt or has too few samples."""
-        if sum(len(part.times_ns) for part in self._parts) < _MIN_SAMPLES:
-            return None
-        angle_q14, distance_q2, quality, times_ns = map(np.concatenate, zip(*self._parts, strict=True))
-        # clockwise in 65536 parts of a turn -> counter-clockwise in [-pi, pi)
-        half_turns = ((32768 - angle_q14) % 65536 - 32768) / 32768
-        ranges = distance_q2 / 4000
-        ranges[(ranges < min_range) | (ranges > max_range)] = 0.0
-        return Scan(
-            stamp_ns=int(times_ns[0]),
-            angles=half_turns * np.pi,
-            ranges=ranges,
-            beam_times=(times_ns - times_ns[0]) * 1e-9,
-            quality=quality.astype(np.float64),
-        )
 
 
 class Rplidar:
@@ -155,7 +103,7 @@ class Rplidar:
         self._fed = 0
         self._last_feed_ns = 0
         self._last_sample_ns: int | None = None
-        self._revolution: _Revolution | None = None  # None before the first start of one
+        self._revolution: Revolution | None = None  # None before the first start of one
 
     @property
     def mode(self) -> str:
@@ -225,16 +173,13 @@ class Rplidar:
             self._clock.restart()
             if self._revolution is not None:
                 self._revolution.spoil()
-        starts = samples.starts.nonzero()[0]
-        self._clock.note_starts(samples.first + starts)
-        times_ns = self._sample_times(samples, arrival_ns)
-        quality = samples.quality if samples.scan_type in _WITH_QUALITY else np.zeros_like(times_ns)
-        part, count = _Part(samples.angle_q14, samples.distance_q2, quality, times_ns), len(times_ns)
+        self._clock.note_starts([samples.first + start for start in samples.starts])
+        line = self._time_line(samples, arrival_ns)
+        ends = [*samples.starts, samples.count]
         scans: list[Scan] = []
-        begins = starts.tolist()
         if self._revolution is not None:
-            self._revolution.add(part.cut(0, begins[0]) if begins else part)
-        for first, end in pairwise([*begins, count]):
+            self._revolution.add(samples, 0, ends[0], line)
+        for first, end in pairwise(ends):
             if self._revolution is not None:
                 scan = self._revolution.scan(self._config.min_range, self._config.max_range)
                 if scan is None:
@@ -242,24 +187,23 @@ class Rplidar:
                 else:
                     scans.append(scan)
                     self._dialogue.hear(scan)
-            self._revolution = _Revolution()
-            self._revolution.add(part.cut(first, end))
+            self._revolution = Revolution(samples.scan_type in _WITH_QUALITY)
+            self._revolution.add(samples, first, end, line)
         return scans
 
-    def _sample_times(self, samples: Samples, arrival_ns: int) -> IntArray:
-        """Time of each sample [ns], strictly ascending over all calls.
+    def _time_line(self, samples: Samples, arrival_ns: int) -> TimeLine:
+        """Times of samples, strictly ascending over all calls.
 
         Where the clock learns that earlier times were too late, the next ones are packed evenly into the
         time there is.
         """
-        scan_type, count = samples.scan_type, len(samples.angle_q14)
+        scan_type = samples.scan_type
         # what arrived after them in the same chunk, or is what their packet had to wait for
         later = (self._fed - samples.end) // PACKET_BYTES[scan_type] * PACKET_SAMPLES[scan_type]
-        end = samples.first + count
-        times_ns = self._clock.times_ns(samples.first, end, end + later, arrival_ns)
+        end = samples.first + samples.count
+        line: TimeLine = self._clock.line(end, end + later, arrival_ns)
         before_ns = self._last_sample_ns
-        if before_ns is not None and times_ns[0] <= before_ns:
-            number = np.arange(1, count + 1)
-            times_ns = before_ns + number * max(count, int(times_ns[-1]) - before_ns) // count
-        self._last_sample_ns = int(times_ns[-1])
-        return times_ns
+        if before_ns is not None and line.host_ns(samples.first + 1) <= before_ns:
+            line = PackedLine(before_ns, samples.first, samples.count, line.host_ns(end) - before_ns)
+        self._last_sample_ns = line.host_ns(end)
+        return line

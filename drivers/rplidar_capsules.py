@@ -16,7 +16,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from drivers.rplidar_nodes import TURN_Q6, BoolArray, ByteArray, Decoded, Numbers, bounded, to_q14
+from drivers.rplidar_nodes import TURN_Q6, BoolArray, ByteArray, Columns, Numbers, Run, bounded, to_q14
 from estimators.messages import IntArray
 
 _NONE = np.zeros(0, np.bool_)
@@ -25,6 +25,7 @@ _BODY = 4  # where the samples begin, after sync, checksum and direction
 _EXPRESS_CABIN = np.dtype([("words", "<u2", (2,)), ("offsets", "u1")])  # two samples
 _NIBBLES = np.stack((np.arange(256) & 15, np.arange(256) >> 4), axis=1)
 _QUALITY_OF_RETURN = 188  # as the SDK reports it where the packets carry none
+_MOST_PACKETS = 64  # wait to be decoded, so that memory is bounded; more than a revolution's
 _MAX_Q6_PER_US = 64 * 360 * 20e-6  # 20 revolutions/s; known devices turn at 15 at most
 
 
@@ -40,12 +41,12 @@ class Capsules(ABC):
 
     def __init__(self) -> None:
         self._max_span_q6 = int(self.SAMPLES * self._SLOWEST_SAMPLE_US * _MAX_Q6_PER_US)
-        self._sample = np.arange(self.SAMPLES)
         self.restart()
 
     def restart(self) -> None:
         """Forget the packets before: what comes next does not continue them."""
         self._start_is_due = False
+        self._batch = CapsuleBatch(self, 0)
 
     def found(self, data: bytes) -> BoolArray:
         """Whether a packet with good sync nibbles and checksum begins at each byte that has room for one."""
@@ -55,79 +56,122 @@ class Capsules(ABC):
         raw = np.frombuffer(data, np.uint8)
         if count == 1:
             whole = int(np.bitwise_xor.reduce(raw[2:]))
-            return np.array([raw[0] == (whole & 15 | _SYNC[0]) and raw[1] == (whole >> 4 | _SYNC[1])])
+            return np.array([data[0] == whole & 15 | _SYNC[0] and data[1] == whole >> 4 | _SYNC[1]])
         folded = np.bitwise_xor.accumulate(raw)
         checksum = folded[self.PACKET_BYTES - 1 :] ^ folded[1 : count + 1]
         begins: BoolArray = raw[:count] == (checksum & 15 | _SYNC[0])
         begins &= raw[1 : count + 1] == (checksum >> 4 | _SYNC[1])
         return begins
 
-    def decode(self, packets: ByteArray) -> list[tuple[int, Decoded]]:
-        """Samples of all packets but the last, where a packet and the one after it fit each other.
+    def runs(self, data: bytes) -> list[Run]:
+        """Runs of all packets but the last, where a packet and the one after it fit each other.
 
         The two need a common scale of angles. They have none when the second says (S) that the device
         restarted its encoder, when the head did not turn (a packet came twice), or when it turned farther
         than the slowest sampling and the fastest rotation of the mode give: then packets were lost whole, or
         the head turned back. The SDK draws this line for the dense modes alone, at 100 revolutions/s.
-
-        Args:
-            packets: (n, PACKET_BYTES), n >= 1.
-
-        Returns:
-            Runs of packets without a gap: index of a run's first packet, its samples.
         """
-        words = packets[:, self._ANGLE_AT : self._ANGLE_AT + 2].copy().view("<u2").ravel().astype(np.int64)
-        angle_q6 = words & 0x7FFF
-        before_q6, after_q6 = angle_q6[:-1], angle_q6[1:]
-        span_q6 = (after_q6 - before_q6) % TURN_Q6
-        passes_0 = after_q6 < before_q6
-        fits = (span_q6 > 0) & (span_q6 <= self._max_span_q6)
-        fits &= (words[1:] < TURN_Q6) & (before_q6 < TURN_Q6)  # S is the highest bit
-        runs: list[tuple[int, Decoded]] = []
-        first = 0
-        for end in [*(~fits).nonzero()[0].tolist(), len(fits)]:
-            if first < end:
-                step_q16 = (span_q6[first:end] << 10) // self.SAMPLES
-                starts = self._starts(angle_q6[first:end], step_q16, passes_0[first:end])
-                runs.append(
-                    (first, self._samples(packets[first : end + 1], angle_q6[first:end], step_q16, starts))
-                )
-            if end < len(fits):
+        size, angle_at = self.PACKET_BYTES, self._ANGLE_AT
+        self._batch = self._batch.open()
+        runs: list[Run] = []
+        goes_on = False
+        word = data[angle_at] | data[angle_at + 1] << 8
+        for index, end in enumerate(range(size, len(data), size)):
+            angle_q6 = word & 0x7FFF
+            word = data[end + angle_at] | data[end + angle_at + 1] << 8
+            span_q6 = (word - angle_q6) % TURN_Q6
+            # S is the highest bit
+            if not (0 < span_q6 <= self._max_span_q6 and word < TURN_Q6 and angle_q6 < TURN_Q6):
                 self.restart()
-            first = end + 1
+                goes_on = False
+                continue
+            if not goes_on:
+                runs.append(Run(index, self._batch, len(self._batch) * self.SAMPLES, 0, []))
+                goes_on = True
+            step_q16 = (span_q6 << 10) // self.SAMPLES
+            start = self._start(angle_q6, step_q16, word < angle_q6)
+            if start is not None:
+                runs[-1].starts.append(runs[-1].count + start)
+            runs[-1].count += self.SAMPLES
+            self._batch.add(data[end - size : end], data[end : end + size], angle_q6, step_q16)
         return runs
 
-    def _samples(
-        self, packets: ByteArray, angle_q6: IntArray, step_q16: IntArray, starts: BoolArray
-    ) -> Decoded:
-        beam_q16 = ((angle_q6[:, None] << 10) + step_q16[:, None] * self._sample).ravel()
-        distance_q2, quality, offset_q16 = self._measure(packets)
-        if offset_q16 is not None:
-            beam_q16 -= offset_q16
-        return Decoded(to_q14(beam_q16 >> 10), distance_q2, quality, starts)
-
     @abstractmethod
-    def _measure(self, packets: ByteArray) -> tuple[IntArray, IntArray, IntArray | None]:
-        """distance_q2, quality, and by how much the beam is behind the head's direction (q16; None for 0)."""
+    def measure(self, packets: ByteArray, before_q2: int) -> tuple[IntArray, IntArray, IntArray | None]:
+        """What the samples of all packets but the last measured.
 
-    def _starts(self, angle_q6: IntArray, step_q16: IntArray, passes_0: BoolArray) -> BoolArray:
-        """True at the last sample before the head's direction passes 0.
+        Args:
+            packets: (n, PACKET_BYTES), n >= 2, that follow each other.
+            before_q2: distance of the sample before, 0 when there is none.
+
+        Returns:
+            distance_q2, quality, and by how much the beam is behind the head's direction (q16; None for 0).
+        """
+
+    def _start(self, angle_q6: int, step_q16: int, passes_0: bool) -> int | None:
+        """Index in a packet of the last sample before the head's direction passes 0.
 
         Steps are rounded down, so the next packet may begin at 0 while the last sample's step falls short of
         it. Then that packet's first sample is the start; in ultra mode the SDK has none.
         """
-        starts = np.zeros(len(step_q16) * self.SAMPLES, np.bool_)
-        starts[0] = self._start_is_due
-        self._start_is_due = False
-        for packet in passes_0.nonzero()[0].tolist():
-            to_0_q16 = (TURN_Q6 - int(angle_q6[packet])) << 10
-            before = min((to_0_q16 - 1) // int(step_q16[packet]), self.SAMPLES)
-            start = packet * self.SAMPLES + before
-            if start < len(starts):
-                starts[start] = True
-            else:
-                self._start_is_due = True
-        return starts
+        if self._start_is_due:
+            self._start_is_due = False
+            return 0
+        if not passes_0:
+            return None
+        before = (((TURN_Q6 - angle_q6) << 10) - 1) // step_q16
+        self._start_is_due = before >= self.SAMPLES
+        return None if self._start_is_due else before
+
+
+class CapsuleBatch:
+    """Samples of capsules without a gap, decoded together: the steps cost the more the fewer they do at once.
+
+    Args:
+        capsules: their format.
+        before_q2: distance of the sample before, 0 when there is none.
+    """
+
+    def __init__(self, capsules: Capsules, before_q2: int) -> None:
+        self._capsules = capsules
+        self._before_q2 = before_q2
+        self._packets: list[bytes] = []  # the last one only tells how those before it go on
+        self._angles_q6: list[int] = []
+        self._steps_q16: list[int] = []
+        self._columns: Columns | None = None
+
+    def __len__(self) -> int:
+        """How many packets have samples here."""
+        return len(self._angles_q6)
+
+    def add(self, packet: bytes, following: bytes, angle_q6: int, step_q16: int) -> None:
+        """Append a packet that follows those that are there: its first angle, its step."""
+        self._packets[-1:] = (packet, following)
+        self._angles_q6.append(angle_q6)
+        self._steps_q16.append(step_q16)
+
+    def open(self) -> "CapsuleBatch":
+        """Where the next packets go: here, or after these when they were asked for or are many."""
+        if self._columns is None and len(self) < _MOST_PACKETS:
+            return self
+        return CapsuleBatch(self._capsules, int(self.decoded().distance_q2[-1]))
+
+    def decoded(self) -> Columns:
+        """See `Batch`."""
+        if self._columns is None:
+            self._columns = self._decode()
+            self._packets.clear()
+        return self._columns
+
+    def _decode(self) -> Columns:
+        packets = np.frombuffer(b"".join(self._packets), np.uint8).reshape(len(self) + 1, -1)
+        beam_q16 = np.array(self._steps_q16)[:, None] * np.arange(self._capsules.SAMPLES)
+        beam_q16 += np.array(self._angles_q6)[:, None] << 10
+        distance_q2, quality, offset_q16 = self._capsules.measure(packets, self._before_q2)
+        beam_q16 = beam_q16.ravel()
+        if offset_q16 is not None:
+            beam_q16 -= offset_q16
+        return Columns(to_q14(beam_q16 >> 10), distance_q2, quality)
 
 
 class ExpressCapsules(Capsules):
@@ -140,7 +184,12 @@ class ExpressCapsules(Capsules):
     SAMPLES = 32
     _SLOWEST_SAMPLE_US = 500
 
-    def _measure(self, packets: ByteArray) -> tuple[IntArray, IntArray, IntArray | None]:
+    def measure(
+        self,
+        packets: ByteArray,
+        before_q2: int,  # noqa: ARG002
+    ) -> tuple[IntArray, IntArray, IntArray | None]:
+        """See `Capsules`."""
         cabins = packets[:-1, _BODY:].copy().view(_EXPRESS_CABIN).ravel()
         words = cabins["words"].astype(np.int64)
         offset_q3 = (words & 3) << 4 | _NIBBLES.take(cabins["offsets"], 0)
@@ -155,7 +204,12 @@ class DenseCapsules(Capsules):
     SAMPLES = 40
     _SLOWEST_SAMPLE_US = 250
 
-    def _measure(self, packets: ByteArray) -> tuple[IntArray, IntArray, IntArray | None]:
+    def measure(
+        self,
+        packets: ByteArray,
+        before_q2: int,  # noqa: ARG002
+    ) -> tuple[IntArray, IntArray, IntArray | None]:
+        """See `Capsules`."""
         words: IntArray = packets[:-1, _BODY:].copy().view("<u2").astype(np.int64)
         distance_q2 = words.ravel() << 2
         return distance_q2, quality_of(distance_q2), None

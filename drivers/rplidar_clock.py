@@ -4,11 +4,9 @@ No I/O and no clock of the host: arrivals go in, host times of samples come out.
 """
 
 import logging
+from collections.abc import Iterable
 
-import numpy as np
-
-from drivers.clock import DeviceClock
-from estimators.messages import IntArray
+from drivers.clock import ClockLine, DeviceClock
 
 _log = logging.getLogger(__name__)
 
@@ -48,39 +46,34 @@ class SampleClock:
         self._revolution: int | None = None  # samples in the last one
         self._window: tuple[int, int] | None = None  # count and arrival at its beginning
 
-    def note_starts(self, counts: IntArray) -> None:
+    def note_starts(self, counts: Iterable[int]) -> None:
         """Take note of where revolutions began.
 
         Args:
-            counts: (N,) numbers of their first samples, in order, before `times_ns` is asked for these.
+            counts: numbers of their first samples, in order, before `line` is asked for these.
         """
-        for count in counts.tolist():
+        for count in counts:
             samples = None if self._last_start is None else count - self._last_start
             if samples is not None and self._revolution is not None:
                 self._is_uneven |= abs(samples - self._revolution) > _UNEVEN * self._revolution
             self._last_start, self._revolution = count, samples
 
-    def times_ns(self, first: int, end: int, newest: int, arrival_ns: int) -> IntArray:
-        """Host times of samples.
+    def line(self, end: int, newest: int, arrival_ns: int) -> ClockLine:
+        """Host times of samples, by how many had been taken with them.
 
         Args:
-            first: number of the first sample, counted from 0.
-            end: number of the last one, plus 1.
+            end: number of the last one of them, counted from 0, plus 1.
             newest: how many samples had been taken when the bytes arrived.
             arrival_ns: when that was, less the latency that is known.
-
-        Returns:
-            (end - first,) [ns].
         """
         self._check_rate(newest, arrival_ns)
         self._clock.observe(newest, arrival_ns)
-        counts = np.arange(first + 1, end + 1)
-        times_ns = self._clock.host_times(counts)
-        if self._late_for_good(int(times_ns[-1]) + (newest - end) * self._sample_ns, arrival_ns):
+        line = self._clock.line
+        if self._late_for_good(line.host_ns(end) + (newest - end) * self._sample_ns, arrival_ns):
             self._clock.restart()
             self._clock.observe(newest, arrival_ns)
-            times_ns = self._clock.host_times(counts)
-        return times_ns
+            line = self._clock.line
+        return line
 
     def _late_for_good(self, newest_ns: int, arrival_ns: int) -> bool:
         """Whether arrivals have been late for longer than a host is busy, and samples seem to be missing."""

@@ -6,7 +6,7 @@ No I/O and no time.
 import numpy as np
 
 from drivers.framing import ByteBuffer, DecodeStats
-from drivers.rplidar_nodes import NODE, TURN_Q6, Angles, BoolArray, NodeArray, node_angles, to_q14
+from drivers.rplidar_nodes import NODE, TURN_Q6, Angles, BoolArray, Columns, NodeArray, node_angles, to_q14
 from drivers.rplidar_protocol import DESCRIPTOR, DESCRIPTOR_BYTES, AnswerType, Event, Samples
 
 _NODE_BYTES = NODE.itemsize
@@ -69,17 +69,13 @@ class NodeStream:
 
     def _give(self, nodes: NodeArray, angle_q6: Angles, end: int, events: list[Event]) -> None:
         flags = nodes["flags"].copy()
-        samples = Samples(
-            AnswerType.STANDARD_SCAN,
-            to_q14(angle_q6),
-            nodes["distance"].astype(np.int64),
-            (flags & 0xFC).astype(np.int64),
-            (flags & 1).view(np.bool_),
-            self._gap,
-            self._arrived,
-            end,
+        columns = Columns(
+            to_q14(angle_q6), nodes["distance"].astype(np.int64), (flags & 0xFC).astype(np.int64)
         )
-        events.append(samples)
+        starts = (flags & 1).nonzero()[0].tolist()
+        events.append(
+            Samples(AnswerType.STANDARD_SCAN, columns, 0, len(nodes), starts, self._gap, self._arrived, end)
+        )
         self._gap = False
         self._arrived += len(nodes)
         self._stats.good += len(nodes)

@@ -9,7 +9,8 @@ import re
 import struct
 import zlib
 from collections.abc import Sequence
-from typing import ClassVar, NamedTuple, TypeAlias
+from dataclasses import dataclass
+from typing import ClassVar, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,13 +37,50 @@ _HQ_CRC_PADDING = bytes(3)  # the CRC runs over whole words of four bytes
 _Q14 = (np.arange(2 * TURN_Q6) % TURN_Q6 << 8) // 90
 
 
-class Decoded(NamedTuple):
-    """Consecutive samples as `drivers.rplidar_protocol.Samples` has them, (N,) each."""
+class Columns(NamedTuple):
+    """Consecutive samples, in the order they were taken.
+
+    Attributes:
+        angle_q14: (N,) int64 [90/16384 deg], clockwise from forward.
+        distance_q2: (N,) int64 [mm/4]; 0 where nothing came back.
+        quality: (N,) int64, 0..255 as the SDK gives it: in standard scans the device's 0..63 times 4; in
+            express, ultra and dense packets, which carry none, 188 with a return and 0 without.
+    """
 
     angle_q14: IntArray
     distance_q2: IntArray
     quality: IntArray
-    starts: BoolArray
+
+    def decoded(self) -> "Columns":
+        """See `Batch`."""
+        return self
+
+
+class Batch(Protocol):
+    """Consecutive samples that may still wait, as packets, to be decoded: all at once costs much less."""
+
+    def decoded(self) -> Columns:
+        """The samples that it has; after this it gets no more."""
+        ...
+
+
+@dataclass(slots=True)
+class Run:
+    """Packets that follow each other.
+
+    Attributes:
+        packet: index of the first one.
+        batch: has their samples.
+        at: index of the first one there.
+        count: how many they are.
+        starts: indices among them of those that begin a revolution, ascending.
+    """
+
+    packet: int
+    batch: Batch
+    at: int
+    count: int
+    starts: list[int]
 
 
 def to_q14(angle_q6: IntArray | Angles) -> IntArray:
@@ -125,16 +163,12 @@ class HqPackets:
             at = data.find(0xA5, at + 1, len(found))
         return found
 
-    def decode(self, packets: ByteArray) -> list[tuple[int, Decoded]]:
-        """Samples of (n, 781) packets, as one run that begins with the first."""
+    def runs(self, data: bytes) -> list[Run]:
+        """Whole packets, as one run."""
+        packets = np.frombuffer(data, np.uint8).reshape(-1, self.PACKET_BYTES)
         nodes = packets[:, _HQ_HEAD_BYTES:-_HQ_CRC_BYTES].copy().view(_HQ_NODE).ravel()
-        decoded = Decoded(
-            nodes["angle"].astype(np.int64),
-            nodes["distance"].astype(np.int64),
-            nodes["quality"].astype(np.int64),
-            nodes["flags"] & 1 == 1,
-        )
-        return [(0, decoded)]
+        columns = Columns(*(nodes[name].astype(np.int64) for name in ("angle", "distance", "quality")))
+        return [Run(0, columns, 0, len(nodes), (nodes["flags"] & 1).nonzero()[0].tolist())]
 
 
 def _hq_crc(body: bytes) -> int:

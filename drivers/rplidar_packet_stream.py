@@ -7,10 +7,8 @@ SDK moves on by what it took for a packet, and loses more.
 import re
 from typing import ClassVar, Protocol
 
-import numpy as np
-
 from drivers.framing import ByteBuffer, DecodeStats
-from drivers.rplidar_nodes import BoolArray, ByteArray, Decoded
+from drivers.rplidar_nodes import BoolArray, Run
 from drivers.rplidar_protocol import DESCRIPTOR, DESCRIPTOR_BYTES, AnswerType, Event, Samples
 
 _WINDOW = 8192  # bytes looked at in one go, so that badly damaged input costs linear time
@@ -34,8 +32,8 @@ class PacketFormat(Protocol):
         """Whether a whole and undamaged packet begins at each byte that has room for one."""
         ...
 
-    def decode(self, packets: ByteArray) -> list[tuple[int, Decoded]]:
-        """Runs of samples of (n, PACKET_BYTES) that follow each other: index of its first packet, samples."""
+    def runs(self, data: bytes) -> list[Run]:
+        """Those of whole packets, without the ones that wait."""
         ...
 
 
@@ -86,6 +84,8 @@ class PacketStream:
     def _count(self, window: bytes, found: BoolArray) -> int:
         """How many packets, at least one, follow each other from the first byte on, up to a descriptor."""
         size = self._format.PACKET_BYTES
+        if len(found) <= size:
+            return 1
         places = found[::size]
         count = int(places.argmin()) or len(places)  # the first is good; it is the least when all are
         for descriptor in DESCRIPTOR.finditer(window, size, count * size):
@@ -121,10 +121,12 @@ class PacketStream:
         data = self._pending + data
         self._pending = data[len(data) - size * layout.WAITING :]
         done = 0
-        for first, decoded in layout.decode(np.frombuffer(data, np.uint8).reshape(-1, size)):
-            gap = self._gap or first > done
-            done = first + len(decoded.starts) // layout.SAMPLES
-            number = first_number + first * layout.SAMPLES
-            events.append(Samples(self._scan_type, *decoded, gap, number, begin + done * size))
+        for run in layout.runs(data):
+            gap = self._gap or run.packet > done
+            done = run.packet + run.count // layout.SAMPLES
+            number, end = first_number + run.packet * layout.SAMPLES, begin + done * size
+            events.append(
+                Samples(self._scan_type, run.batch, run.at, run.count, run.starts, gap, number, end)
+            )
             self._gap = False
         self._gap = self._gap or done < len(data) // size - layout.WAITING

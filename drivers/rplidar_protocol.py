@@ -16,8 +16,7 @@ from operator import xor
 from typing import TypeAlias
 
 from drivers.framing import ByteBuffer, DecodeStats
-from drivers.rplidar_nodes import BoolArray
-from estimators.messages import IntArray
+from drivers.rplidar_nodes import Batch, Columns
 
 
 class Command(IntEnum):
@@ -248,11 +247,10 @@ class Samples:
 
     Attributes:
         scan_type: kind of the packets they came in.
-        angle_q14: (N,) int64 [90/16384 deg], clockwise from forward.
-        distance_q2: (N,) int64 [mm/4]; 0 where nothing came back.
-        quality: (N,) int64, 0..255 as the SDK gives it: in standard scans the device's 0..63 times 4; in
-            express, ultra and dense packets, which carry none, 188 with a return and 0 without.
-        starts: (N,) bool, True at the first sample of a revolution.
+        batch: has their values.
+        at: index of the first one there.
+        count: how many they are.
+        starts: indices among them of those that begin a revolution, ascending.
         gap: True when samples may be missing just before these; there are none missing in between.
         first: number of the first of these samples, counted from 0 at the scan's descriptor over all packets
             that arrived. Times the sample duration it is a clock of the device that runs on between two
@@ -262,13 +260,18 @@ class Samples:
     """
 
     scan_type: AnswerType
-    angle_q14: IntArray
-    distance_q2: IntArray
-    quality: IntArray
-    starts: BoolArray
+    batch: Batch
+    at: int
+    count: int
+    starts: list[int]
     gap: bool
     first: int
     end: int
+
+    @property
+    def columns(self) -> Columns:
+        """Their values."""
+        return Columns(*(column[self.at : self.at + self.count] for column in self.batch.decoded()))
 
 
 Answer: TypeAlias = DeviceInfo | Health | SampleRate | AccBoardFlag | LidarConf | ConfSet

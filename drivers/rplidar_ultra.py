@@ -43,7 +43,12 @@ class UltraCapsules(Capsules):
     SAMPLES = 96
     _SLOWEST_SAMPLE_US = 200
 
-    def _measure(self, packets: ByteArray) -> tuple[IntArray, IntArray, IntArray | None]:
+    def measure(
+        self,
+        packets: ByteArray,
+        before_q2: int,  # noqa: ARG002
+    ) -> tuple[IntArray, IntArray, IntArray | None]:
+        """See `Capsules`."""
         words = packets[:, _ULTRA_BODY:].copy().view("<i4").ravel()
         words = words[: (len(packets) - 1) * _ULTRA_WORDS + 1].astype(np.int64)
         rounded = _MAJOR_PACKED.take(words & 0xFFF)
@@ -136,12 +141,8 @@ class UltraDenseCapsules(Capsules):
     _ANGLE_AT = 8
     _SLOWEST_SAMPLE_US = 125
 
-    def restart(self) -> None:
-        """Forget the packets before: what comes next does not continue them."""
-        super().restart()
-        self._last_q2 = 0
-
-    def _measure(self, packets: ByteArray) -> tuple[IntArray, IntArray, IntArray | None]:
+    def measure(self, packets: ByteArray, before_q2: int) -> tuple[IntArray, IntArray, IntArray | None]:
+        """See `Capsules`."""
         cabins = packets[:-1, _ULTRA_DENSE_BODY:].copy().view(_ULTRA_DENSE_CABIN).ravel()
         values = cabins["words"].astype(np.int64)
         high = cabins["high"].astype(np.int64)
@@ -151,23 +152,23 @@ class UltraDenseCapsules(Capsules):
         scale = values & 3
         quality = (values >> (12 + scale)) << scale
         distance_q2 = (values & ((0x1000 << scale) - 4)) * (2 + scale) + _SCALE_Q2[scale]
-        self._smooth(distance_q2, scale == 0)
+        _smooth(distance_q2, scale == 0, before_q2)
         return distance_q2, quality, None
 
-    def _smooth(self, distance_q2: IntArray, near: BoolArray) -> None:
-        """Take the mean with the (smoothed) distance before where it differs little; in place."""
-        # Near distances are told in steps of the limit, and smoothing moves them by half of it at most: what
-        # is farther from the one before as it was told is also farther from it as it was smoothed.
-        steps = np.abs(np.diff(distance_q2, prepend=self._last_q2))
-        candidates = np.flatnonzero(near & (steps <= _SMOOTHED_Q2)).tolist()
-        if candidates:
-            values = distance_q2.tolist()
-            values.append(self._last_q2)  # it is before the first one, at index -1
-            for i in candidates:
-                if values[i - 1] and abs(values[i] - values[i - 1]) <= _SMOOTHED_Q2:
-                    values[i] = (values[i] + values[i - 1]) >> 1
-            distance_q2[:] = values[:-1]
-        self._last_q2 = int(distance_q2[-1])
+
+def _smooth(distance_q2: IntArray, near: BoolArray, before_q2: int) -> None:
+    """Take the mean with the (smoothed) distance before where it differs little; in place."""
+    # Near distances are told in steps of the limit, and smoothing moves them by half of it at most: what
+    # is farther from the one before as it was told is also farther from it as it was smoothed.
+    steps = np.abs(np.diff(distance_q2, prepend=before_q2))
+    candidates = np.flatnonzero(near & (steps <= _SMOOTHED_Q2)).tolist()
+    if candidates:
+        values = distance_q2.tolist()
+        values.append(before_q2)  # it is before the first one, at index -1
+        for i in candidates:
+            if values[i - 1] and abs(values[i] - values[i - 1]) <= _SMOOTHED_Q2:
+                values[i] = (values[i] + values[i - 1]) >> 1
+        distance_q2[:] = values[:-1]
 
 
 def encode_ultra_dense_capsule(

@@ -39,12 +39,10 @@ rngs = st.integers(0, 2**32).map(random.Random)
 
 def nodes(events: Iterable[Event]) -> list[Node]:
     return [
-        (int(angle), int(distance), int(quality), int(start))
+        (int(angle), int(distance), int(quality), int(i in event.starts))
         for event in events
         if isinstance(event, Samples)
-        for angle, distance, quality, start in zip(
-            event.angle_q14, event.distance_q2, event.quality, event.starts, strict=True
-        )
+        for i, (angle, distance, quality) in enumerate(zip(*event.columns, strict=True))
     ]
 
 
@@ -74,14 +72,13 @@ def one_by_one(events: Iterable[Event]) -> list[object]:
     for event in events:
         if isinstance(event, Samples):
             size, group = PACKET_BYTES[event.scan_type], PACKET_SAMPLES[event.scan_type]
-            count = len(event.starts)
             flat += [
                 Placed(
                     event.scan_type,
                     node,
                     event.gap and i == 0,
                     event.first + i,
-                    event.end - (count - 1 - i) // group * size,
+                    event.end - (event.count - 1 - i) // group * size,
                 )
                 for i, node in enumerate(nodes([event]))
             ]

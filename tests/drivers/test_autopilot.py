@@ -278,3 +278,18 @@ def test_no_number_in_a_message_makes_a_measurement_that_is_not_finite(
     for measurement in line.say(message, component=197 if kind == "odometry" else 1):
         values = [getattr(measurement, slot) for slot in type(measurement).__slots__]
         assert all(np.isfinite(value).all() for value in values)
+
+
+@pytest.mark.parametrize("field", range(6))
+@pytest.mark.parametrize("number", [np.nan, np.inf, -np.inf])
+def test_one_number_that_is_not_finite_spoils_an_inertial_sample_and_no_other(
+    field: int, number: float
+) -> None:
+    line = Line(imu=100)
+    sound = [0.5, -0.5, 3e38, 3e38, 3e38, 1.0]  # their sum is finite
+    bad = [*sound[:field], number, *sound[field + 1 :]]
+    found = [
+        line.say(mavlink2.MAVLink_highres_imu_message(line.boot_ms * 1000, *values, *[0.0] * 7, 63))
+        for values in (sound, bad, sound)
+    ]
+    assert [len(each) for each in found] == [1, 0, 1]

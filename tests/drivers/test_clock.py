@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.clock import DeviceClock
+from drivers.clock import ClockLine, DeviceClock
 from estimators.messages import FloatArray, IntArray
 
 MS = 1_000_000
@@ -46,6 +46,23 @@ def test_jitter_is_removed_and_quartz_drift_is_followed(rate: float, drift: floa
     assert np.abs(settled).max() < 2 * MS
     assert np.std(settled) < 0.6 * MS
     assert np.std(arrival_ns - true_ns) > 4 * MS
+
+
+@given(
+    zero_ns=st.integers(-(10**15), 10**18),
+    point_ns=st.integers(0, 10**15),
+    drift=st.floats(-0.02, 0.02),
+    readings=st.lists(st.integers(-(10**6), 10**9), min_size=1, max_size=20),
+)
+def test_many_readings_have_the_times_that_each_has(
+    zero_ns: int, point_ns: int, drift: float, readings: list[int]
+) -> None:
+    line = ClockLine(zero_ns, 125_000, zero_ns + point_ns, 10**9, drift)
+    assert line.host_times(np.array(readings)).tolist() == [line.host_ns(reading) for reading in readings]
+    for reading in readings:
+        since_ns = reading * line.tick_ns - point_ns
+        late_ns = line.host_ns(reading) - (zero_ns + reading * line.tick_ns + line.delay_ns)
+        assert abs(late_ns - drift * since_ns) <= 0.5 + 1e-15 * abs(since_ns)
 
 
 @pytest.mark.parametrize("drift", [-0.016, 0.016])
@@ -120,8 +137,8 @@ def test_restart_forgets_the_offset_and_keeps_the_drift() -> None:
     stamps(clock, ticks, (7 * SECOND + ticks * tick_ns * (1 + drift)).astype(np.int64))
     clock.restart()
     clock.observe(0, 50 * SECOND)
-    assert clock.host_ns(0) == 50 * SECOND
-    assert clock.host_ns(-100) == pytest.approx(50 * SECOND - 100 * tick_ns * (1 + drift), abs=MS)
+    assert clock.line.host_ns(0) == 50 * SECOND
+    assert clock.line.host_ns(-100) == pytest.approx(50 * SECOND - 100 * tick_ns * (1 + drift), abs=MS)
 
 
 readings = st.lists(
@@ -135,7 +152,7 @@ def test_the_newest_reading_is_never_from_the_future(readings: list[tuple[int, i
     for ticks, later_ns in readings:
         arrival_ns += later_ns
         clock.observe(ticks, arrival_ns)
-        assert clock.host_ns(ticks) <= arrival_ns
+        assert clock.line.host_ns(ticks) <= arrival_ns
 
 
 @given(readings)

@@ -191,10 +191,10 @@ def test_samples_are_numbered_and_say_where_their_packet_ended() -> None:
     assert [(event.first, event.end) for event in single] == [(0, 15 + 84), (32, 15 + 168)]
     _, together = feed([b"".join(sent)])
     assert isinstance(together, Samples)
-    assert (together.first, together.end, len(together.starts)) == (0, 15 + 168, 64)
+    assert (together.first, together.end, together.count) == (0, 15 + 168, 64)
     _, samples = feed([STANDARD + standard_nodes(3) + b"\x3e"])
     assert isinstance(samples, Samples)
-    assert (samples.first, samples.end, len(samples.starts)) == (0, 7 + 15, 3)
+    assert (samples.first, samples.end, samples.count) == (0, 7 + 15, 3)
 
 
 @pytest.mark.parametrize("scan_type", MODES)

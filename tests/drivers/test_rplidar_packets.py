@@ -9,13 +9,16 @@ import pytest
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
+from drivers.framing import DecodeStats
 from drivers.rplidar_capsules import encode_dense_capsule, encode_express_capsule, framed, start_word
+from drivers.rplidar_decoder import AnswerDecoder
 from drivers.rplidar_nodes import TURN_Q6, encode_hq_packet, encode_standard_node
-from drivers.rplidar_protocol import PACKET_SAMPLES, AnswerType, Samples, encode_descriptor
+from drivers.rplidar_protocol import PACKET_SAMPLES, AnswerType, Event, Samples, encode_descriptor
 from drivers.rplidar_ultra import encode_ultra_capsule, encode_ultra_dense_capsule, ultra_offset_q16
 from estimators.messages import FloatArray
 from tests import vectors
-from tests.drivers.rplidar_samples import CAPSULES, Node, feed, nodes, packets
+from tests.drivers.rplidar_samples import CAPSULES, Node, feed, nodes, packets, rngs
+from tests.fuzz.well_formed import held_bytes
 
 angles_q6 = st.integers(0, TURN_Q6 - 1)
 spans_q6 = st.integers(1, 45 * 64)
@@ -37,7 +40,7 @@ def heads_deg(start_q6: int, span_q6: int, count: int) -> FloatArray:
 
 
 def assert_angles(samples: Samples, expected_deg: FloatArray) -> None:
-    error_deg = samples.angle_q14 * 90 / 16384 - expected_deg
+    error_deg = samples.columns.angle_q14 * 90 / 16384 - expected_deg
     # rounded down: to 1/64 deg, to 90/16384 deg, and every step to 1/65536 deg
     most_deg = 1 / 64 + 90 / 16384 + len(expected_deg) / 65536
     assert np.abs((error_deg + 180) % 360 - 180).max() <= most_deg
@@ -83,12 +86,12 @@ def test_an_express_capsule_round_trips(
     first = encode_express_capsule(start_q6, True, distances_mm, offsets_q3)
     following = encode_express_capsule((start_q6 + span_q6) % TURN_Q6, False, [0] * 32, [0] * 32)
     samples = decode(AnswerType.EXPRESS_SCAN, first, following)
-    assert samples.distance_q2.tolist() == [4 * mm for mm in distances_mm]
-    assert samples.quality.tolist() == [188 if mm else 0 for mm in distances_mm]
+    assert samples.columns.distance_q2.tolist() == [4 * mm for mm in distances_mm]
+    assert samples.columns.quality.tolist() == [188 if mm else 0 for mm in distances_mm]
     heads = heads_deg(start_q6, span_q6, 32)
     assert_angles(samples, heads - np.array(offsets_q3) / 8)
     # a revolution starts with the last direction before 0
-    assert samples.starts.tolist() == [a < 360 <= a + span_q6 / 64 / 32 for a in heads]
+    assert samples.starts == [i for i, a in enumerate(heads) if a < 360 <= a + span_q6 / 64 / 32]
 
 
 @given(angles_q6, spans_q6, each(40, st.integers(0, 65535)))
@@ -96,8 +99,8 @@ def test_a_dense_capsule_round_trips(start_q6: int, span_q6: int, distances_mm: 
     first = encode_dense_capsule(start_q6, True, distances_mm)
     following = encode_dense_capsule((start_q6 + span_q6) % TURN_Q6, False, [0] * 40)
     samples = decode(AnswerType.DENSE_SCAN, first, following)
-    assert samples.distance_q2.tolist() == [4 * mm for mm in distances_mm]
-    assert samples.quality.tolist() == [188 if mm else 0 for mm in distances_mm]
+    assert samples.columns.distance_q2.tolist() == [4 * mm for mm in distances_mm]
+    assert samples.columns.quality.tolist() == [188 if mm else 0 for mm in distances_mm]
     assert_angles(samples, heads_deg(start_q6, span_q6, 40))
 
 
@@ -117,18 +120,18 @@ def test_an_ultra_capsule_round_trips_along_a_wall(
     start_q6: int, span_q6: int, distances_mm: list[int]
 ) -> None:
     samples = ultra(start_q6, span_q6, distances_mm)
-    for sent_mm, got_q2 in zip(distances_mm, samples.distance_q2.tolist(), strict=False):
+    for sent_mm, got_q2 in zip(distances_mm, samples.columns.distance_q2.tolist(), strict=False):
         # the step is that of a neighbour, which may lie beyond the next limit
         assert abs(got_q2 / 4 - sent_mm) <= ultra_grid_mm(sent_mm + 200)
-    offsets_deg = ultra_offset_q16(samples.distance_q2 >> 2) / 65536
+    offsets_deg = ultra_offset_q16(samples.columns.distance_q2 >> 2) / 65536
     assert_angles(samples, heads_deg(start_q6, span_q6, 96) - offsets_deg)
-    assert set(samples.quality.tolist()) == {188}
+    assert set(samples.columns.quality.tolist()) == {188}
 
 
 @given(rooms)
 def test_an_ultra_capsule_tells_any_distance_or_no_return(distances_mm: list[int]) -> None:
     samples = ultra(0, 2000, distances_mm)
-    got_mm = [q2 / 4 for q2 in samples.distance_q2.tolist()]
+    got_mm = [q2 / 4 for q2 in samples.columns.distance_q2.tolist()]
     for i, (sent, got) in enumerate(zip(distances_mm, got_mm, strict=False)):
         told = distances_mm[i // 3 * 3], distances_mm[i // 3 * 3 + 3]
         base = told[0] if i % 3 == 0 else (told[0] or told[1]) if i % 3 == 1 else told[1]
@@ -139,7 +142,7 @@ def test_an_ultra_capsule_tells_any_distance_or_no_return(distances_mm: list[int
             assert abs(got - sent) <= grid
         else:
             assert got == 0 or abs(got - sent) <= grid
-    assert samples.quality.tolist() == [188 if mm else 0 for mm in got_mm]
+    assert samples.columns.quality.tolist() == [188 if mm else 0 for mm in got_mm]
 
 
 def ultra(start_q6: int, span_q6: int, distances_mm: list[int]) -> Samples:
@@ -158,7 +161,7 @@ def test_ultra_distances_are_rounded_as_by_the_peer(stem: str) -> None:
         words = np.array([major | 1 << 12 | 0x200 << 22 for major, _, _ in part], "<u4")
         first = framed(start_word(0, True) + words.tobytes())
         following = framed(start_word(1000, False) + words.tobytes())
-        threes = decode(AnswerType.ULTRA_SCAN, first, following).distance_q2.reshape(-1, 3) // 4
+        threes = decode(AnswerType.ULTRA_SCAN, first, following).columns.distance_q2.reshape(-1, 3) // 4
         assert threes[:, 0].tolist() == [mm for _, mm, _ in part]
         assert [one for one, (_, mm, _) in zip(threes[:, 1], part, strict=True) if mm] == [
             mm + (1 << level) for _, mm, level in part if mm
@@ -182,7 +185,7 @@ def ultra_threes(major: int, difference1: int, difference2: int) -> list[list[in
     words = np.full(32, word, "<u4").tobytes()
     first, following = framed(start_word(0, True) + words), framed(start_word(1000, False) + words)
     threes: list[list[int]] = (
-        decode(AnswerType.ULTRA_SCAN, first, following).distance_q2.reshape(-1, 3).tolist()
+        decode(AnswerType.ULTRA_SCAN, first, following).columns.distance_q2.reshape(-1, 3).tolist()
     )
     return threes
 
@@ -206,7 +209,11 @@ def test_an_ultra_dense_capsule_round_trips_for_far_targets(
 ) -> None:
     samples = ultra_dense(start_q6, span_q6, distances_mm, qualities)
     for sent, got_q2, quality, got_quality in zip(
-        distances_mm, samples.distance_q2.tolist(), qualities, samples.quality.tolist(), strict=True
+        distances_mm,
+        samples.columns.distance_q2.tolist(),
+        qualities,
+        samples.columns.quality.tolist(),
+        strict=True,
     ):
         scale = 1 if sent <= 8187 else 2 if sent <= 24567 else 3
         assert abs(got_q2 / 4 - sent) <= (2 + scale) / 2
@@ -242,6 +249,41 @@ def test_near_targets_of_ultra_dense_are_smoothed_as_in_the_sdk(
         assert [q2 for _, q2, _, _ in nodes(events)] == expected
 
 
+@pytest.mark.parametrize("scan_type", CAPSULES)
+@given(rng=rngs)
+def test_when_samples_are_asked_for_does_not_matter(scan_type: AnswerType, rng: random.Random) -> None:
+    if scan_type is AnswerType.ULTRA_DENSE_SCAN:  # so near each other that each depends on the one before
+        near_mm = [[rng.randint(998, 1002) for _ in range(64)] for _ in range(12)]
+        sent = [
+            encode_ultra_dense_capsule(1000 * i, False, distances_mm, [7] * 64, 0)
+            for i, distances_mm in enumerate(near_mm)
+        ]
+    else:
+        sent = packets(scan_type, range(100, 12_000, 1000), rng, first_flag=False)
+    lost = rng.randrange(1, 11)
+    sent[lost : lost + rng.choice((0, 0, 8))] = []  # so many that there is a gap
+    sent.insert(0, encode_descriptor(scan_type))
+    decoder, events = AnswerDecoder(DecodeStats()), list[Event]()
+    for packet in sent:
+        events += decoder.feed(packet)
+        if rng.random() < 0.4:
+            nodes([rng.choice(events)])
+    for event in rng.sample(events, len(events)):
+        nodes([event])
+    assert nodes(events) == nodes(feed([b"".join(sent)]))
+
+
+@pytest.mark.parametrize("scan_type", CAPSULES)
+def test_packets_that_nobody_asks_for_do_not_pile_up(scan_type: AnswerType) -> None:
+    sent = packets(scan_type, range(0, 1_000_000, 1000), random.Random(0), first_flag=False)
+    decoder = AnswerDecoder(DecodeStats())
+    last = feed([encode_descriptor(scan_type), *sent])[-1]
+    decoder.feed(encode_descriptor(scan_type))
+    events = [decoder.feed(packet) for packet in sent][-1]
+    assert held_bytes(decoder) < 250_000
+    assert nodes(events) == nodes([last])
+
+
 def test_smoothing_does_not_reach_across_a_gap() -> None:
     def sent(start_q6: int, distance_mm: int) -> bytes:
         return encode_ultra_dense_capsule(start_q6, False, [distance_mm] * 64, [7] * 64, 0)
@@ -253,8 +295,8 @@ def test_smoothing_does_not_reach_across_a_gap() -> None:
         first, second = feed([encode_descriptor(AnswerType.ULTRA_DENSE_SCAN), *chunks])[1:]
         assert isinstance(first, Samples)
         assert isinstance(second, Samples)
-        assert set(first.distance_q2.tolist()) == {4000}
-        assert set(second.distance_q2.tolist()) == {4008}
+        assert set(first.columns.distance_q2.tolist()) == {4000}
+        assert set(second.columns.distance_q2.tolist()) == {4008}
 
 
 def ultra_dense(start_q6: int, span_q6: int, distances_mm: list[int], qualities: list[int]) -> Samples:
@@ -278,7 +320,7 @@ def test_each_time_the_head_passes_0_there_is_one_start(
     sent = packets(scan_type, turned_q6.tolist(), random.Random(0))
     opening = encode_descriptor(scan_type)
     events = feed([opening + b"".join(sent)] if in_one_chunk else [opening, *sent])
-    starts = np.concatenate([event.starts for event in events if isinstance(event, Samples)])
+    starts = [start for _, _, _, start in nodes(events)]
     group = PACKET_SAMPLES[scan_type]
     assert len(starts) == len(spans) * group
     passed_q6 = np.arange(1, turned_q6[-1] // TURN_Q6 + 1) * TURN_Q6

@@ -178,11 +178,14 @@ def test_a_malformed_measurement_is_found(
 @pytest.mark.parametrize(
     ("field", "change"),
     [
-        ("angle_q14", lambda angles: angles + 65536),
-        ("distance_q2", lambda distances: -1 - distances),
-        ("quality", lambda qualities: qualities + 256),
-        ("quality", lambda qualities: qualities[1:]),
-        ("starts", lambda starts: starts.astype(int)),
+        ("batch", lambda batch: batch.decoded()._replace(angle_q14=batch.decoded().angle_q14 + 65536)),
+        ("batch", lambda batch: batch.decoded()._replace(distance_q2=-1 - batch.decoded().distance_q2)),
+        ("batch", lambda batch: batch.decoded()._replace(quality=batch.decoded().quality + 256)),
+        ("batch", lambda batch: batch.decoded()._replace(quality=batch.decoded().quality[:0])),
+        ("at", lambda at: at + 1_000_000),
+        ("count", lambda count: count + 100_000),
+        ("starts", lambda starts: [*starts, 100_000]),
+        ("starts", lambda starts: [1, 0, *starts]),
         ("end", lambda end: end + SHORT),
     ],
 )

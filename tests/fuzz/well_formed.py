@@ -53,10 +53,12 @@ def require_well_formed(measurement: Measurement, now_ns: int) -> None:
 def require_well_formed_samples(samples: Samples, fed: int) -> None:
     """Check samples that were given out after `fed` bytes."""
     try:
-        columns = {name: getattr(samples, name) for name in _SAMPLE_ENDS}
-        _require_equal_lengths((*columns.values(), samples.starts))
-        require(samples.starts.dtype == np.bool, "start flags are no flags")
-        for name, column in columns.items():
+        columns = samples.columns
+        _require_equal_lengths(columns)
+        require(len(columns[0]) == samples.count, "count is wrong")
+        require(samples.starts == sorted(set(samples.starts)), "starts are out of order")
+        require(set(samples.starts) <= set(range(samples.count)), "starts are none of these")
+        for name, column in columns._asdict().items():
             last = _SAMPLE_ENDS[name] - 1
             require((column >= 0).all() and (column <= last).all(), f"{name} is not within 0..{last}")
         require(0 < samples.end <= fed, f"end {samples.end} is not within 1..{fed}")

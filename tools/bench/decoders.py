@@ -150,7 +150,11 @@ def _samples(mode: Mode) -> Benchmark:
 
     def decode() -> list[Event]:
         decoder = AnswerDecoder(DecodeStats())
-        return [event for chunk in chunks for event in decoder.feed(chunk)]
+        events = [event for chunk in chunks for event in decoder.feed(chunk)]
+        for event in events:
+            if isinstance(event, Samples):
+                event.batch.decoded()  # what waits to be done for all at once is done
+        return events
 
     ours = _polar(decode())
     if len(ours) != _sample_count(mode, stream):
@@ -233,8 +237,8 @@ def _fed(driver: str, chunks: list[bytes], stamps_ns: list[int]) -> list[Measure
 def _polar(events: Sequence[Event]) -> FloatArray:
     """Samples as the peers have them: (N, 2) direction clockwise [deg], distance [mm]."""
     samples = [event for event in events if isinstance(event, Samples)]
-    angle_q14 = np.concatenate([part.angle_q14 for part in samples])
-    distance_q2 = np.concatenate([part.distance_q2 for part in samples])
+    angle_q14 = np.concatenate([part.columns.angle_q14 for part in samples])
+    distance_q2 = np.concatenate([part.columns.distance_q2 for part in samples])
     return np.column_stack((angle_q14 * (90 / 16384), distance_q2 / 4))
 
 

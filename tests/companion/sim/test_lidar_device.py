@@ -191,8 +191,8 @@ def test_ultra_beams_leave_the_head_at_an_angle_that_depends_on_the_distance(tmp
     host.ask(encode_request(Command.EXPRESS_SCAN, bytes((3, 0, 0, 0, 0))), SECOND)
     host.listen(SECOND)
     samples = [e for e in host.listen(2 * SECOND) if isinstance(e, Samples)]
-    angle = np.concatenate([s.angle_q14 for s in samples])
-    distance = np.concatenate([s.distance_q2 for s in samples]) / 4000
+    angle = np.concatenate([s.columns.angle_q14 for s in samples])
+    distance = np.concatenate([s.columns.distance_q2 for s in samples]) / 4000
     residual = np.rad2deg(np.unwrap(angle / 32768 * np.pi)) - np.arange(len(angle)) * 360 * 10 * 127e-6
     near, far = (distance > 0.5) & (distance < 1.5), distance > 4.0
     # Spec of the optics: some 6.2 to 7.1 deg for the near ones, 7.7 for the far ones.
