@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from estimators.kernels.algebra import cholesky, solve_lower, solve_upper
+from estimators.kernels.algebra import cholesky, solve_lower, solve_upper, wrapped
 from estimators.kernels.compilation import MATRIX, VECTOR, compiled
 from estimators.kernels.scan_lines import INTEGERS, IntegerArray, associate
 from estimators.messages import FloatArray
@@ -261,3 +261,37 @@ def settle(
             gain += np.outer(vectors[:, k], vectors[:, k]) / values[k]
     keyframe_cov = variance * gain @ gradient_noise(rows, index, scale, spans, count) @ gain
     return matched, states, information, held, keyframe_cov, rows, index
+
+
+@compiled(
+    f"Tuple(({VECTOR}, {MATRIX}))({MATRIX}, {MATRIX}, {MATRIX}, {MATRIX}, {VECTOR}, {VECTOR}, float64)"
+)
+def said_by_scan(
+    prior: FloatArray,
+    information: FloatArray,
+    held: FloatArray,
+    keyframe_cov: FloatArray,
+    predicted: FloatArray,
+    states: FloatArray,
+    least: float,
+) -> tuple[FloatArray, FloatArray]:
+    """Newer pose (3,) and its covariance (3, 3) without what the motion model added.
+
+    Args:
+        prior: (12, 12) information on the states beforehand.
+        information: (12, 12) the same with the scan.
+        held: (3, 3) projection of a change of the pose on what walls hold.
+        keyframe_cov: (3, 3) share of the map's own noise.
+        predicted: (12,) states beforehand.
+        states: (12,) what they became.
+        least: information [1/m^2, 1/rad^2] that every direction has.
+
+    Source: Bar-Shalom et al., Tracking and Data Fusion, 9.5: tracklets by decorrelation.
+    """
+    after = newest_information(information)
+    # What walls hold tells of the rest by what the motion model thinks of both: that is not the scan's.
+    gained = held @ (after - newest_information(prior)) @ held
+    cov = np.linalg.inv(gained + least * np.eye(3))
+    pose = predicted[6:9] + held.T @ (cov @ (after @ (states[6:9] - predicted[6:9])))
+    pose[2] = wrapped(pose[2])
+    return pose, cov + keyframe_cov
