@@ -263,9 +263,7 @@ def settle(
     return matched, states, information, held, keyframe_cov, rows, index
 
 
-@compiled(
-    f"Tuple(({VECTOR}, {MATRIX}))({MATRIX}, {MATRIX}, {MATRIX}, {MATRIX}, {VECTOR}, {VECTOR}, float64)"
-)
+@compiled(f"Tuple(({VECTOR}, {MATRIX}))({MATRIX}, {MATRIX}, {MATRIX}, {MATRIX}, {VECTOR}, {VECTOR}, float64)")
 def said_by_scan(
     prior: FloatArray,
     information: FloatArray,

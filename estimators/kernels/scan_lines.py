@@ -202,8 +202,10 @@ def associate(
                 for k in range(begin[r * columns + first], begin[r * columns + last + 1]):
                     dx, dy = x - lines[k, 0], y - lines[k, 1]
                     distance = dx * dx + dy * dy
-                    cosine = abs(normal_x * lines[k, 2] + normal_y * lines[k, 3])
-                    if distance < best and cosine > LEAST_COSINE:
+                    if (
+                        distance < best
+                        and abs(normal_x * lines[k, 2] + normal_y * lines[k, 3]) > LEAST_COSINE
+                    ):
                         nearest, best = k, distance
         index[i] = -1
         if nearest < 0:

@@ -23,8 +23,8 @@ def prior_on_states(
         cov: (6, 6) of it.
 
     Returns:
-        Information (12, 12) on the older and the newer state; both states (12,) as they are predicted; standard
-        deviations (3,) of the newer pose.
+        Information (12, 12) on the older and the newer state; both states (12,) as they are predicted;
+        standard deviations (3,) of the newer pose.
     """
     of_motion = np.linalg.inv(Q)
     across = F.T @ of_motion

@@ -39,8 +39,8 @@ def returns(
         spacing: of beams where they end [m].
 
     Returns:
-        Points (M, 2) [m], body frame; their times (M,) [s] after the last of all beams, so never positive; and
-        which of them to keep, (M,), so that there is at least about the spacing between them.
+        Points (M, 2) [m], body frame; their times (M,) [s] after the last of all beams, so never positive;
+        and which of them to keep, (M,), so that there is at least about the spacing between them.
     """
     count = len(angles)
     kept, found = np.empty(count, dtype=np.int64), 0

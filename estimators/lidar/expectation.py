@@ -58,7 +58,7 @@ class Expectation:
     modes: Callable[[FloatArray], FloatArray]
 
     def prior(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Information (12, 12) on the states, the states (12,), and standard deviations (3,) of the newer pose."""
+        """Information (12, 12) on the states, the states (12,), and doubt (3,) of the newer pose (sigmas)."""
         return prior_on_states(self.F, self.Q, self.state, self.cov)
 
     def seen_from_end(self, states: FloatArray) -> FloatArray:
