@@ -172,6 +172,14 @@ def newest_information(information: FloatArray) -> FloatArray:
     return last @ last.T
 
 
+@compiled(f"{MATRIX}({MATRIX})")
+def newest_covariance(information: FloatArray) -> FloatArray:
+    """Covariance (6, 6) of the newer pose and velocity from information on both states (12, 12)."""
+    last = cholesky(information)[6:, 6:].copy()
+    cov: FloatArray = np.linalg.inv(last @ last.T)
+    return 0.5 * (cov + cov.T)
+
+
 @compiled(
     f"Tuple((int64, {VECTOR}, {MATRIX}, {MATRIX}, {MATRIX}, {MATRIX}, {INTEGERS}))"
     f"({MATRIX}, {MATRIX}, {MATRIX}, {MATRIX}, int64[:, ::1], {INTEGERS}, {VECTOR}, int64, int64, {MATRIX}, "
@@ -292,4 +300,5 @@ def said_by_scan(
     cov = np.linalg.inv(gained + least * np.eye(3))
     pose = predicted[6:9] + held.T @ (cov @ (after @ (states[6:9] - predicted[6:9])))
     pose[2] = wrapped(pose[2])
-    return pose, cov + keyframe_cov
+    cov += keyframe_cov
+    return pose, 0.5 * (cov + cov.T)

@@ -69,4 +69,4 @@ def bent(
     for k in range(count):
         gain = gains[:, 3 * k : 3 * k + 3].copy()
         cov += gain @ deviation @ gain.T
-    return cov
+    return 0.5 * (cov + cov.T)

@@ -193,4 +193,13 @@ class LineMap:
         increment, cov = kernels.said_by_scan(
             prior, information, held, keyframe_cov, predicted, states, LEAST_INFORMATION
         )
-        return Fit(states, information, held, increment, cov, matched / len(index), rows, index)
+        return Fit(
+            states,
+            kernels.newest_covariance(information),
+            held,
+            increment,
+            cov,
+            matched / len(index),
+            rows,
+            index,
+        )

@@ -31,7 +31,7 @@ class Fit:
 
     Attributes:
         states: (12,) pose and velocity at the end of the scan before, and at the end of this one.
-        information: (12, 12) inverse of their covariance, the prior's included.
+        cov: (6, 6) of the newer pose and velocity, the prior included.
         held: (3, 3) projection of a change of the pose on what walls hold.
         increment: (3,) newer pose without what the motion model added.
         increment_cov: (3, 3) of it.
@@ -41,7 +41,7 @@ class Fit:
     """
 
     states: FloatArray
-    information: FloatArray
+    cov: FloatArray
     held: FloatArray
     increment: FloatArray
     increment_cov: FloatArray

@@ -8,7 +8,6 @@ What goes out is what the scan says alone: the motion model's share is taken out
 again, and a direction that no wall holds comes out wide.
 """
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,7 +15,7 @@ from pydantic import Field
 
 from estimators.geometry import rotation, transform_each
 from estimators.lidar.known_motion import GyroTrack, OdometryTrack
-from estimators.lidar.scan_fit import UNKNOWN_SPEED_SIGMA, search_start
+from estimators.lidar.scan_fit import UNKNOWN_SPEED_SIGMA, Fit, search_start
 from estimators.lidar.scan_preparation import LEAST_GAP_NS, PreparedScan, ScanPreparation
 from estimators.messages import FloatArray, ImuSample, Measurement, PoseIncrement, Scan
 from estimators.models.motion_settings import MotionInScans
@@ -29,20 +28,6 @@ KEYFRAME_SHARE = 0.7
 
 _LEAST_VARIANCE = 1e-9
 """Of a pose [m^2, rad^2], so that no covariance is singular."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Match:
-    """A scan in place: both states (12,), covariance of the newer (6, 6), increment and its covariance.
-
-    The share is that of the surface points that are matched.
-    """
-
-    states: FloatArray
-    cov: FloatArray
-    increment: FloatArray
-    increment_cov: FloatArray
-    share: float
 
 
 class ScanMatcher:
@@ -200,7 +185,7 @@ class ScanMatcher:
             or abs(self._state[2]) > np.deg2rad(self._config.keyframe_angle_deg)
         )
 
-    def _match(self, scan: PreparedScan, keyframe: "LineMap") -> _Match | None:
+    def _match(self, scan: PreparedScan, keyframe: "LineMap") -> Fit | None:
         """Put a scan where it fits; leaves the deskewed points in `points` when it does."""
         config = self._config
         dt = (scan.stamp_ns - self._stamp_ns) * 1e-9
@@ -231,16 +216,11 @@ class ScanMatcher:
         if fit.share < least_share or is_another:
             return None
 
-        states, cov = fit.states, fit.increment_cov
-        self.points = expected.seen_from_end(states)
+        self.points = expected.seen_from_end(fit.states)
         bent = expected.bent(found.own, fit.rows, fit.index)
-        states[9:11] += rotation(states[8]) @ expected.twist[:2]
-        states[11] += expected.twist[2]
-        velocity = states[9:]
-        cov += (1e-3 * config.stamp_sigma_ms) ** 2 * np.outer(velocity, velocity)
-        cov += bent
-        cov_of_state = np.linalg.inv(fit.information)[6:, 6:]
-        cov_of_state[:3, :3] += bent
-        return _Match(
-            states, 0.5 * (cov_of_state + cov_of_state.T), fit.increment, 0.5 * (cov + cov.T), fit.share
-        )
+        velocity, cov = fit.states[9:], fit.increment_cov
+        velocity[:2] += rotation(fit.states[8]) @ expected.twist[:2]
+        velocity[2] += expected.twist[2]
+        cov += (1e-3 * config.stamp_sigma_ms) ** 2 * np.outer(velocity, velocity) + bent
+        fit.cov[:3, :3] += bent
+        return fit
