@@ -137,11 +137,11 @@ class ScanMatcher:
         self._keyframe = None
 
     def _observe(self, measurement: Measurement) -> None:
-        if isinstance(measurement, PoseIncrement):
-            self.odometry.add(measurement)
-        elif isinstance(measurement, ImuSample):
+        if isinstance(measurement, ImuSample):
             if self._noise.gyro_sigma:
                 self._gyro.add(measurement)
+        elif isinstance(measurement, PoseIncrement):
+            self.odometry.add(measurement)
         else:
             self._preparation.observe(measurement)
 
