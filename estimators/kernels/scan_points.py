@@ -1,4 +1,4 @@
-"""Points of a scan: what came back, how far it is, and where it is seen from the end of the scan."""
+"""Points of a scan: what came back, how far it is, and where it is as seen from the end of the scan."""
 
 from math import cos, hypot, pi, sin, sqrt, tau
 
@@ -68,6 +68,33 @@ def returns(
             apart[k] = reached > cell
             cell, before = reached, angle
     return points, times, apart
+
+
+@compiled(f"{MATRIX}({VECTOR}, {VECTOR}, {VECTOR}, {VECTOR})")
+def ends_of_beams(
+    angles: FloatArray, ranges: FloatArray, beam_times: FloatArray, T_last_first: FloatArray
+) -> FloatArray:
+    """Where beams that came back ended, as the scanner sees it at the last beam.
+
+    Args:
+        angles: (N,) [rad], lidar frame.
+        ranges: (N,) [m]; 0, or not finite, where nothing came back.
+        beam_times: (N,) [s] after the first beam.
+        T_last_first: (3,) scanner at the first beam, seen from where it was at the last; it moved steadily.
+
+    Returns:
+        (M, 2) [m].
+    """
+    ends, found = np.empty((len(angles), 2)), 0
+    for i in range(len(angles)):
+        if not 0.0 < ranges[i] < np.inf:
+            continue
+        to_go = 1.0 - beam_times[i] / beam_times[-1]
+        angle = angles[i] + to_go * T_last_first[2]
+        ends[found, 0] = to_go * T_last_first[0] + ranges[i] * cos(angle)
+        ends[found, 1] = to_go * T_last_first[1] + ranges[i] * sin(angle)
+        found += 1
+    return ends[:found]
 
 
 @compiled(f"Tuple((float64, float64, float64))({MATRIX}, {MATRIX}, {VECTOR})")
