@@ -1,7 +1,8 @@
-"""What is thought of the motion between two scans: prior on the states, and how far it bends a scan."""
+"""Motion between two scans: prior, what of the result the scan alone says, and how it bends a scan."""
 
 import numpy as np
 
+from estimators.kernels.algebra import cholesky, wrapped
 from estimators.kernels.compilation import INDICES, MATRIX, VECTOR, compiled
 from estimators.kernels.scan_lines import IntegerArray
 from estimators.messages import FloatArray
@@ -35,6 +36,59 @@ def prior_on_states(
     prior[6:, 6:] = of_motion
     predicted[:6], predicted[6:] = state, F @ state
     return prior, predicted, np.sqrt(np.diag(F @ cov @ F.T + Q)[:3])
+
+
+@compiled(f"{MATRIX}({MATRIX})")
+def newest_information(information: FloatArray) -> FloatArray:
+    """Information (3, 3) on the newer pose in that on both states (12, 12), whatever the others are."""
+    ordered = np.empty((12, 12))
+    order = np.array([0, 1, 2, 3, 4, 5, 9, 10, 11, 6, 7, 8])
+    for i in range(12):
+        for j in range(12):
+            ordered[i, j] = information[order[i], order[j]]
+    last = cholesky(ordered)[9:, 9:].copy()
+    return last @ last.T
+
+
+@compiled(f"{MATRIX}({MATRIX})")
+def newest_covariance(information: FloatArray) -> FloatArray:
+    """Covariance (6, 6) of the newer pose and velocity from information on both states (12, 12)."""
+    last = cholesky(information)[6:, 6:].copy()
+    cov = np.linalg.inv(last @ last.T)
+    return 0.5 * (cov + cov.T)
+
+
+@compiled(f"Tuple(({VECTOR}, {MATRIX}))({MATRIX}, {MATRIX}, {MATRIX}, {MATRIX}, {VECTOR}, {VECTOR}, float64)")
+def said_by_scan(
+    prior: FloatArray,
+    information: FloatArray,
+    held: FloatArray,
+    keyframe_cov: FloatArray,
+    predicted: FloatArray,
+    states: FloatArray,
+    least: float,
+) -> tuple[FloatArray, FloatArray]:
+    """Newer pose (3,) and its covariance (3, 3) without what the motion model added.
+
+    Args:
+        prior: (12, 12) information on the states beforehand.
+        information: (12, 12) the same with the scan.
+        held: (3, 3) projection of a change of the pose on what walls hold.
+        keyframe_cov: (3, 3) share of the map's own noise.
+        predicted: (12,) states beforehand.
+        states: (12,) what they became.
+        least: information [1/m^2, 1/rad^2] that every direction has.
+
+    Source: Bar-Shalom et al., Tracking and Data Fusion, 9.5: tracklets by decorrelation.
+    """
+    after = newest_information(information)
+    # What walls hold tells of the rest by what the motion model thinks of both: that is not the scan's.
+    gained = held @ (after - newest_information(prior)) @ held
+    cov = np.linalg.inv(gained + least * np.eye(3))
+    pose = predicted[6:9] + held.T @ (cov @ (after @ (states[6:9] - predicted[6:9])))
+    pose[2] = wrapped(pose[2])
+    cov += keyframe_cov
+    return pose, 0.5 * (cov + cov.T)
 
 
 @compiled(f"{MATRIX}({MATRIX}, {VECTOR}, {MATRIX}, {INDICES}, {MATRIX})")

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from estimators.kernels import scan_fit as kernels
 from estimators.kernels.scan_lines import associate, fit_lines, sort_into_cells
+from estimators.kernels.scan_motion import newest_covariance, said_by_scan
 from estimators.kernels.scan_points import extent
 from estimators.lidar.scan_fit import LEAST_INFORMATION, Fit
 from estimators.messages import FloatArray, IntArray
@@ -190,12 +191,12 @@ class LineMap:
         )
         if matched < kernels.LEAST_MATCHED:
             return None
-        increment, cov = kernels.said_by_scan(
+        increment, cov = said_by_scan(
             prior, information, held, keyframe_cov, predicted, states, LEAST_INFORMATION
         )
         return Fit(
             states,
-            kernels.newest_covariance(information),
+            newest_covariance(information),
             held,
             increment,
             cov,

@@ -91,9 +91,10 @@ class ScanPreparation:
     def prepare(self, scan: Scan) -> PreparedScan:
         """The returns of a scan that are good for anything."""
         config, stamp_ns = self._config, scan.end_stamp_ns
-        columns = (np.ascontiguousarray(column) for column in (scan.angles, scan.ranges, scan.beam_times))
         points, times, apart = self._returns(
-            *columns,
+            np.ascontiguousarray(scan.angles),
+            np.ascontiguousarray(scan.ranges),
+            np.ascontiguousarray(scan.beam_times),
             self._T_body_lidar,
             config.min_range,
             config.max_range,

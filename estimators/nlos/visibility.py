@@ -108,5 +108,10 @@ class Visibility:
             return
         mounting = self._setup.lidar_in_body
         T_map_first, T_map_last = (compose(np.array([*p.xy, p.yaw]), mounting) for p in (begin, end))
-        columns = (np.ascontiguousarray(column) for column in (scan.angles, scan.ranges, scan.beam_times))
-        self.grid.insert(T_map_last, self._ends_of_beams(*columns, between(T_map_last, T_map_first)))
+        ends = self._ends_of_beams(
+            np.ascontiguousarray(scan.angles),
+            np.ascontiguousarray(scan.ranges),
+            np.ascontiguousarray(scan.beam_times),
+            between(T_map_last, T_map_first),
+        )
+        self.grid.insert(T_map_last, ends)

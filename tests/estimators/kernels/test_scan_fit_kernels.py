@@ -15,10 +15,10 @@ from estimators.kernels.scan_fit import (
     MOST_ITERATIONS,
     gradient_noise,
     held_directions,
-    newest_information,
     normal_equations,
 )
 from estimators.kernels.scan_lines import LEAST_COSINE, associate
+from estimators.kernels.scan_motion import newest_information
 from estimators.lidar.line_map import LineMap, Surface, surface
 from estimators.lidar.scan_fit import LEAST_INFORMATION
 from estimators.messages import FloatArray, IntArray
