@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from math import hypot, sqrt
+from math import degrees, exp, hypot, inf, sqrt
 
 import numpy as np
 
@@ -163,30 +163,34 @@ class HealthMonitor:
         """Take note of what the estimator made of a measurement."""
         if self._begin_ns is None:
             self._begin_ns = measurement_stamp_ns(measurement)
-        if not isinstance(measurement, RangeFrame | PoseIncrement):
-            return
+        if isinstance(measurement, RangeFrame):
+            self._observe_ranges(measurement, report)
+        elif isinstance(measurement, PoseIncrement):
+            self._note = report.note
+            if Verdict.ACCEPTED in report.verdicts and measurement.from_stamp_ns < measurement.stamp_ns:
+                self._increment_ns = measurement.stamp_ns
+
+    def _observe_ranges(self, frame: RangeFrame, report: Report) -> None:
         self._note = report.note
-        stamp_ns = measurement.stamp_ns
-        good = report.verdicts.count(Verdict.ACCEPTED)
-        if isinstance(measurement, PoseIncrement):
-            if good and measurement.from_stamp_ns < stamp_ns:
-                self._increment_ns = stamp_ns
-            return
-        self._observe_anchors(measurement, report)
-        gated = [i for i, verdict in enumerate(report.verdicts) if verdict is Verdict.GATED]
+        self._observe_anchors(frame, report)
+        verdicts, stamp_ns = report.verdicts, frame.stamp_ns
+        good = verdicts.count(Verdict.ACCEPTED)
         # What else speaks for a blocked range says nothing of the pose.
-        judged = good + sum(verdict in _DISAGREES for verdict in report.verdicts)
-        contradicting = sum(verdict is Verdict.CONTRADICTS for verdict in report.verdicts)
+        judged = good + sum(map(verdicts.count, _DISAGREES))
+        contradicting = verdicts.count(Verdict.CONTRADICTS)
         if contradicting > good:  # fewer are the anchors' fault
             judged += contradicting
         if not judged:
             return
         if good:
             self._range_ns = stamp_ns
+        too_short = 0
         # An estimator may gate without saying by how much.
-        too_short = int(np.count_nonzero(report.residuals[gated] < 0.0)) if len(report.residuals) else 0
+        if Verdict.GATED in verdicts and len(report.residuals):
+            told = zip(verdicts, report.residuals.tolist(), strict=True)
+            too_short = sum(verdict is Verdict.GATED and residual < 0.0 for verdict, residual in told)
         dt = 0.0 if self._share_stamp_ns is None else (stamp_ns - self._share_stamp_ns) * 1e-9
-        keep = float(np.exp(-dt / MEMORY))
+        keep = exp(-dt / MEMORY)
         self._accepted_share = keep * self._accepted_share + (1.0 - keep) * good / judged
         self._short_share = keep * self._short_share + (1.0 - keep) * too_short / judged
         self._share_stamp_ns = stamp_ns
@@ -248,7 +252,8 @@ class HealthMonitor:
         if awaited:
             return Health(State.STARTING, f"waiting for a {awaited[0]}")
         cov = pose.cov[: self._used, : self._used]
-        if np.isposinf(pose.cov[5, 5]) and self._used == 6:
+        variance_yaw = float(pose.cov[5, 5])
+        if variance_yaw == inf and self._used == 6:
             what = self._note or self._heading_advice or "start again on the start mark"
             return Health(State.LOST, f"heading not known: {what}", self._note or "heading not known")
         if not (np.isfinite(pose.T_map_body).all() and np.isfinite(cov).all()):
@@ -259,8 +264,7 @@ class HealthMonitor:
         if sigma_xy > table.max_sigma_xy:
             what = f"position sigma {sigma_xy:.2f} m"
             return Health(State.LOST, f"{what} above {table.max_sigma_xy:g} m", what)
-        sigma_yaw = float(np.rad2deg(np.sqrt(pose.cov[5, 5])))
-        if self._used == 6 and sigma_yaw > table.max_sigma_yaw_deg:
+        if self._used == 6 and (sigma_yaw := degrees(sqrt(variance_yaw))) > table.max_sigma_yaw_deg:
             what = f"heading sigma {sigma_yaw:.0f} deg"
             why = f"{what} above {table.max_sigma_yaw_deg:g} deg"
             return Health(State.LOST, ": ".join(filter(None, (why, self._heading_advice))), what)

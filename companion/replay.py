@@ -5,6 +5,7 @@ import time
 from collections import Counter, defaultdict
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
+from itertools import starmap
 from math import isinf
 from pathlib import Path
 from statistics import fmean
@@ -78,10 +79,11 @@ class _TimedFrontEnd:
         self._stopwatch = stopwatch
 
     def update(self, measurement: Measurement) -> PoseIncrement | None:
+        if not isinstance(measurement, Scan):
+            return self._front_end.update(measurement)
         begin = time.perf_counter()
         increment = self._front_end.update(measurement)
-        if isinstance(measurement, Scan):
-            self._stopwatch.note(begin)
+        self._stopwatch.note(begin)
         return increment
 
     @property
@@ -102,7 +104,7 @@ class Replay:
         update_times: estimator (and `front_end`) -> time of its updates.
         verdicts: estimator -> how often each verdict was given to a range or increment.
         anchor_verdicts: estimator -> anchor -> the same of its ranges.
-        range_lines: lines of `ranges.csv`, of the primary.
+        ranges: frames of ranges, and what the primary made of them.
         iterations: estimator -> steps of its solver for each frame; empty without such a solver.
         health: state -> number of ticks.
         sensors: sensor -> what its decoder counted.
@@ -118,7 +120,7 @@ class Replay:
     update_times: dict[str, Stopwatch] = field(default_factory=dict)
     verdicts: dict[str, Counter[str]] = field(default_factory=dict)
     anchor_verdicts: dict[str, dict[int, Counter[str]]] = field(default_factory=dict)
-    range_lines: list[str] = field(default_factory=list)
+    ranges: list[tuple[RangeFrame, Report]] = field(default_factory=list)
     iterations: dict[str, list[int]] = field(default_factory=dict)
     health: Counter[str] = field(default_factory=Counter)
     sensors: dict[str, DecodeStats] = field(default_factory=dict)
@@ -185,15 +187,17 @@ def replay(
         ticks_ns.append(tick.stamp_ns)
         result.health[tick.health.state] += 1
         for outcome in tick.outcomes:
-            if isinstance(outcome.measurement, RangeFrame | PoseIncrement):
+            if isinstance(outcome.measurement, PoseIncrement):
                 for name, report in outcome.reports.items():
                     result.verdicts[name].update(report.verdicts)
-            if isinstance(outcome.measurement, RangeFrame):
+            elif isinstance(outcome.measurement, RangeFrame):
                 frame = outcome.measurement
-                result.range_lines.append(range_lines(frame, outcome.reports[names[0]]))
+                result.ranges.append((frame, outcome.reports[names[0]]))
                 for name, report in outcome.reports.items():
+                    result.verdicts[name].update(report.verdicts)
+                    anchors = result.anchor_verdicts[name]
                     for anchor_id, verdict in zip(frame.anchor_ids.tolist(), report.verdicts, strict=True):
-                        result.anchor_verdicts[name][anchor_id][verdict] += 1
+                        anchors[anchor_id][verdict] += 1
                     if report.iterations is not None:
                         result.iterations[name].append(report.iterations)
         for name, pose in tick.poses.items():
@@ -245,7 +249,8 @@ def write_outputs(result: Replay, folder: Path) -> None:
         for i, name in enumerate(result.names):
             text = "".join(tum_line(pose) for pose in result.poses[name])
             (folder / (f"poses_{name}.tum" if i else "poses.tum")).write_text(text, encoding="utf-8")
-        (folder / "ranges.csv").write_text(HEADER + "".join(result.range_lines), encoding="utf-8")
+        ranges = "".join(starmap(range_lines, result.ranges))
+        (folder / "ranges.csv").write_text(HEADER + ranges, encoding="utf-8")
         (folder / "summary.json").write_text(json.dumps(summary(result), indent=2) + "\n", encoding="utf-8")
         (folder / "config.toml").write_text(result.config.to_toml(), encoding="utf-8")
     except OSError as error:

@@ -8,7 +8,7 @@ import numpy as np
 
 from estimators.lidar.floor_map import FloorMap
 from estimators.lidar.scan_preparation import ScanPreparation
-from estimators.messages import PLANAR, FloatArray, Measurement, PoseEstimate
+from estimators.messages import FloatArray, Measurement, PoseEstimate
 from estimators.models.range_bias import BearingBias
 
 
@@ -149,7 +149,8 @@ class Setup:
     def lift_covariance(self, planar: FloatArray) -> FloatArray:
         """Covariance (6, 6) of PoseEstimate from that of (x, y, yaw), (3, 3)."""
         cov = np.zeros((6, 6))
-        cov[PLANAR] = planar
+        cov[:2, :2], cov[5, 5] = planar[:2, :2], planar[2, 2]
+        cov[:2, 5], cov[5, :2] = planar[:2, 2], planar[2, :2]
         cov[2, 2] = self.height_sigma**2
         cov[3, 3] = cov[4, 4] = self.level_sigma**2
         return cov

@@ -4,13 +4,13 @@ Coordinates are those of the grid: in units of cells from its corner, x along th
 rows, so that cell ``[row, column]`` covers x from `column` to `column + 1` and y from `row` to `row + 1`.
 """
 
-from math import floor, inf
+from math import cos, floor, inf, sin
 from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from estimators.kernels.compilation import MATRIX, compiled, inlined
+from estimators.kernels.compilation import MATRIX, VECTOR, compiled, inlined
 from estimators.messages import FloatArray
 
 CellArray: TypeAlias = NDArray[np.float32]
@@ -36,6 +36,33 @@ def within(position: float, direction: float, cells: int) -> tuple[float, float]
         return (0.0, 1.0) if 0.0 <= position < cells else (1.0, 0.0)
     low, high = -position / direction, (cells - position) / direction
     return max(min(low, high), 0.0), min(max(low, high), 1.0)
+
+
+@compiled(f"Tuple(({MATRIX}, {VECTOR}, {VECTOR}))({VECTOR}, {MATRIX}, float64)")
+def in_cells(
+    T_map_lidar: FloatArray, points: FloatArray, cell: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Ends of beams in units of cells from the map's origin.
+
+    Args:
+        T_map_lidar: (3,) x [m], y [m], yaw [rad] of the LiDAR in the map.
+        points: (N, 2) [m], lidar frame.
+        cell: side of a cell [m].
+
+    Returns:
+        (N, 2); the least and the greatest (2,) of them and the LiDAR's own, NaN when any is not finite.
+    """
+    ends, least, greatest = np.empty_like(points), T_map_lidar[:2] / cell, T_map_lidar[:2] / cell
+    c, s = cos(T_map_lidar[2]), sin(T_map_lidar[2])
+    for i in range(len(points)):
+        x, y = points[i, 0], points[i, 1]
+        ends[i, 0] = (c * x - s * y + T_map_lidar[0]) / cell
+        ends[i, 1] = (s * x + c * y + T_map_lidar[1]) / cell
+        for k in range(2):
+            least[k], greatest[k] = min(least[k], ends[i, k]), max(greatest[k], ends[i, k])
+            if not np.isfinite(ends[i, k]):
+                return ends, np.full(2, np.nan), greatest
+    return ends, least, greatest
 
 
 @compiled(f"void({CELLS}, int32[:, ::1], int32, float64, float64, {MATRIX}, float32, float32, float32)")
@@ -71,21 +98,24 @@ def trace_scan(
         if seen[row, column] != scan:
             seen[row, column] = scan
             log_odds[row, column] = min(log_odds[row, column] + hit, limit)
+    flat_odds, flat_seen, columns = log_odds.ravel(), seen.ravel(), seen.shape[1]
     for i in range(len(ends)):
-        column, row = floor(x), floor(y)
-        end_column, end_row = floor(ends[i, 0]), floor(ends[i, 1])
         step_x, next_x, gap_x = crossing(x, ends[i, 0] - x)
         step_y, next_y, gap_y = crossing(y, ends[i, 1] - y)
         # The number of steps is known: rounding of the lengths cannot lead past the end, out of the grid.
-        for _ in range(abs(end_column - column) + abs(end_row - row)):
-            if seen[row, column] != scan:
-                seen[row, column] = scan
-                log_odds[row, column] = max(log_odds[row, column] - miss, -limit)
-            if column != end_column and (next_x < next_y or row == end_row):
-                column += step_x
+        left_x, left_y = abs(floor(ends[i, 0]) - floor(x)), abs(floor(ends[i, 1]) - floor(y))
+        at, step_y = floor(y) * columns + floor(x), step_y * columns
+        for _ in range(left_x + left_y):
+            if flat_seen[at] != scan:
+                flat_seen[at] = scan
+                flat_odds[at] = max(flat_odds[at] - miss, -limit)
+            if left_x > 0 and (next_x < next_y or left_y == 0):
+                left_x -= 1
+                at += step_x
                 next_x += gap_x
             else:
-                row += step_y
+                left_y -= 1
+                at += step_y
                 next_y += gap_y
 
 

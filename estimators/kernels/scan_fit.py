@@ -160,18 +160,6 @@ def held_directions(pose_hessian: FloatArray, feigned: FloatArray) -> FloatArray
     return held
 
 
-@compiled(f"{MATRIX}({MATRIX})")
-def newest_information(information: FloatArray) -> FloatArray:
-    """Information (3, 3) on the newer pose in that on both states (12, 12), whatever the others are."""
-    ordered = np.empty((12, 12))
-    order = np.array([0, 1, 2, 3, 4, 5, 9, 10, 11, 6, 7, 8])
-    for i in range(12):
-        for j in range(12):
-            ordered[i, j] = information[order[i], order[j]]
-    last = cholesky(ordered)[9:, 9:].copy()
-    return last @ last.T
-
-
 @compiled(
     f"Tuple((int64, {VECTOR}, {MATRIX}, {MATRIX}, {MATRIX}, {MATRIX}, {INTEGERS}))"
     f"({MATRIX}, {MATRIX}, {MATRIX}, {MATRIX}, int64[:, ::1], {INTEGERS}, {VECTOR}, int64, int64, {MATRIX}, "

@@ -25,14 +25,15 @@ LEAST_COSINE = 0.8
 """Lines whose normals differ by more (37 deg) are of different surfaces."""
 
 
-@compiled(f"Tuple(({MATRIX}, int64[:, ::1], {INTEGERS}))({MATRIX}, float64, float64)")
+@compiled(f"Tuple(({MATRIX}, int64[:, ::1], {INTEGERS}))({MATRIX}, boolean[::1], float64, float64)")
 def fit_lines(
-    points: FloatArray, reach: float, sigma: float
+    points: FloatArray, wanted: NDArray[np.bool_], reach: float, sigma: float
 ) -> tuple[FloatArray, IntegerArray, IntegerArray]:
     """Lines through the neighbourhoods of points that lie on a surface.
 
     Args:
         points: (N, 2) [m] in the order of the beams.
+        wanted: (N,) whose lines are asked for; they go through all points.
         reach: half the length of a neighbourhood [m].
         sigma: standard deviation of a range [m].
 
@@ -49,6 +50,8 @@ def fit_lines(
     own = np.empty(count, dtype=np.int64)
     found = 0
     for i in range(count):
+        if not wanted[i]:
+            continue
         x0, y0 = points[i, 0], points[i, 1]
         n, sx, sy, sxx, sxy, syy = 1, 0.0, 0.0, 0.0, 0.0, 0.0
         taken_least, gap_most = count, 0.0
@@ -199,8 +202,10 @@ def associate(
                 for k in range(begin[r * columns + first], begin[r * columns + last + 1]):
                     dx, dy = x - lines[k, 0], y - lines[k, 1]
                     distance = dx * dx + dy * dy
-                    cosine = abs(normal_x * lines[k, 2] + normal_y * lines[k, 3])
-                    if distance < best and cosine > LEAST_COSINE:
+                    if (
+                        distance < best
+                        and abs(normal_x * lines[k, 2] + normal_y * lines[k, 3]) > LEAST_COSINE
+                    ):
                         nearest, best = k, distance
         index[i] = -1
         if nearest < 0:

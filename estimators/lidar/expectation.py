@@ -10,9 +10,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from estimators.geometry import compose, rotation, transform_each
+from estimators.kernels.scan_motion import bent, prior_on_states
+from estimators.kernels.scan_points import seen_from_end
 from estimators.lidar.known_motion import GyroTrack, OdometryTrack
 from estimators.lidar.scan_preparation import PreparedScan
-from estimators.messages import FloatArray
+from estimators.messages import FloatArray, IntArray
 from estimators.models.motion import cubic_between, smooth_motion
 
 _LEAST_VARIANCE = 1e-8
@@ -32,6 +34,7 @@ class Expectation:
 
     Attributes:
         points: (N, 2) [m] of the beams, moved along the known motion to the end of the scan.
+        shares: (N,) of the way in time from the scan before.
         basis: (N, 4) weights of the two poses and velocities in what is left of each beam's pose.
         state: (6,) pose and velocity at the end of the scan before, moved along the known motion.
         cov: (6, 6) of it.
@@ -44,6 +47,7 @@ class Expectation:
     """
 
     points: FloatArray
+    shares: FloatArray
     basis: FloatArray
     state: FloatArray
     cov: FloatArray
@@ -53,21 +57,24 @@ class Expectation:
     deviation: FloatArray
     modes: Callable[[FloatArray], FloatArray]
 
-    def bent(self, shares: FloatArray, by_pose: FloatArray) -> FloatArray:
+    def prior(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Information (12, 12) on the states, the states (12,), and doubt (3,) of the newer pose (sigmas)."""
+        return prior_on_states(self.F, self.Q, self.state, self.cov)
+
+    def seen_from_end(self, states: FloatArray) -> FloatArray:
+        """All points (N, 2) [m] as the body sees them at the end of the scan, for states (12,)."""
+        return seen_from_end(self.points, self.basis, states)
+
+    def bent(self, own: IntArray, rows: FloatArray, index: IntArray) -> FloatArray:
         """Covariance (3, 3) that the pose at the end has because motion between the states bends the scan.
 
-        Each mode moves the beams, and by them the pose that fits best.
-
         Args:
-            shares: (M,) of the way in time from the scan before, of the beams that are matched.
-            by_pose: (M, 3) change of each beam's distance from its line with the pose at its instant.
+            own: (M,) which points are held against lines.
+            rows: (M, 6) what `associate` says of them.
+            index: (M,) likewise.
         """
-        by_end = shares[:, None] * by_pose
-        hessian = by_end.T @ by_end + _LEAST_VARIANCE * np.eye(3)
-        pulls = by_end.T @ (self.modes(shares)[:, :, None] * by_pose)
-        gains = np.linalg.solve(hessian, pulls)
-        cov: FloatArray = (gains @ self.deviation @ gains.transpose(0, 2, 1)).sum(axis=0)
-        return cov
+        shares = self.shares.take(own)
+        return bent(self.modes(shares), shares, rows, index, self.deviation)
 
 
 def bridge(shares: FloatArray) -> FloatArray:
@@ -128,7 +135,7 @@ def expect(
     first_ns = min(since_ns, scan.stamp_ns + round(float(scan.times[0]) * 1e9))
     moved = odometry.motion(since_ns, scan.stamp_ns) if odometry.covers(first_ns, scan.stamp_ns) else None
     if moved is not None:
-        return _along_odometry(scan, state, cov, dt, moved, odometry)
+        return _along_odometry(scan, shares, state, cov, dt, moved, odometry)
     if gyro.covers(first_ns, scan.stamp_ns):
         F, Q = smooth_motion(dt, noise.accel, noise.gyro_sigma, noise.bandwidth)
         turn = -float(gyro.turns(scan.stamp_ns, np.array([-dt]))[0])
@@ -141,6 +148,7 @@ def expect(
         twist = np.array([0.0, 0.0, gyro.rate()])
         return Expectation(
             transform_each(beams, scan.points),
+            shares,
             cubic_between(shares, dt),
             state,
             cov,
@@ -152,7 +160,16 @@ def expect(
         )
     F, Q = smooth_motion(dt, noise.accel, noise.yaw_accel, noise.bandwidth)
     return Expectation(
-        scan.points, cubic_between(shares, dt), state, cov, F, Q, np.zeros(3), _sway(Q, dt), clamped_bar
+        scan.points,
+        shares,
+        cubic_between(shares, dt),
+        state,
+        cov,
+        F,
+        Q,
+        np.zeros(3),
+        _sway(Q, dt),
+        clamped_bar,
     )
 
 
@@ -167,6 +184,7 @@ def _sway(Q: FloatArray, dt: float) -> FloatArray:
 
 def _along_odometry(
     scan: PreparedScan,
+    shares: FloatArray,
     state: FloatArray,
     cov: FloatArray,
     dt: float,
@@ -189,10 +207,10 @@ def _along_odometry(
     moved_cov[3:, 3:] = Q[3:, 3:] = drift / dt**2
     Q[:3, :3] = drift
     F = np.diag([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
-    share = 1.0 + scan.times / dt
-    basis = np.column_stack([1.0 - share, np.zeros(len(share)), share, np.zeros(len(share))])
+    basis = np.column_stack([1.0 - shares, np.zeros(len(shares)), shares, np.zeros(len(shares))])
     return Expectation(
         transform_each(odometry.beams(scan.stamp_ns, scan.times), scan.points),
+        shares,
         basis,
         np.concatenate([pose, np.zeros(3)]),
         moved_cov,

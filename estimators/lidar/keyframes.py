@@ -1,6 +1,7 @@
 """Odometry increments from a known start, in stamp order: what every estimator on them does alike."""
 
 from abc import ABC, abstractmethod
+from math import inf
 
 import numpy as np
 from pydantic import Field
@@ -125,15 +126,16 @@ class KeyframeTracker(ABC):
             planar[2, :2] = planar[:2, 2] = 0.0
             planar[2, 2] = np.inf
         # It walks level: what it does upward is as uncertain as its height within a second.
-        velocity_cov = np.diag([0.0, 0.0, self._setup.height_sigma**2])
-        velocity_cov[:2, :2] = cov[3:5, 3:5]
+        velocity, velocity_cov = np.zeros(3), np.zeros((3, 3))
+        velocity[:2], velocity_cov[:2, :2] = state[3:5], cov[3:5, 3:5]
+        velocity_cov[2, 2] = self._setup.height_sigma**2
         return PoseEstimate(
             stamp_ns,
             lift(state[:3], self._setup.height),
             self._setup.lift_covariance(planar),
             self._reset_counter,
-            velocity=np.array([state[3], state[4], 0.0]),
-            velocity_cov=velocity_cov,
+            velocity,
+            velocity_cov,
         )
 
     def _reaches(self, stamp_ns: int) -> bool:
@@ -169,5 +171,9 @@ class KeyframeTracker(ABC):
 
 
 def is_covariance(cov: FloatArray) -> bool:
-    """Whether a matrix is finite and positive definite."""
-    return bool(np.isfinite(cov).all() and np.linalg.eigvalsh(cov)[0] > 0.0)
+    """Whether a symmetric matrix (3, 3) is finite and positive definite, as its leading minors tell."""
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = cov.tolist()
+    minor = xx * yy - xy * yx
+    whole = xx * (yy * zz - yz * zy) - xy * (yx * zz - yz * zx) + xz * (yx * zy - yy * zx)
+    # All nine numbers are in the last: one that is not finite leaves it so.
+    return bool(xx > 0.0 and minor > 0.0 and 0.0 < whole < inf)

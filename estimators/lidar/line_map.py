@@ -7,7 +7,9 @@ from numpy.typing import NDArray
 
 from estimators.kernels import scan_fit as kernels
 from estimators.kernels.scan_lines import associate, fit_lines, sort_into_cells
-from estimators.lidar.scan_fit import Fit
+from estimators.kernels.scan_motion import newest_covariance, said_by_scan
+from estimators.kernels.scan_points import extent
+from estimators.lidar.scan_fit import LEAST_INFORMATION, Fit
 from estimators.messages import FloatArray, IntArray
 
 LINE_REACH = 10.0
@@ -25,28 +27,39 @@ class Surface:
         spans: (M, 2) first and last point of each line.
         own: (M,) which point each line belongs to.
         points: (M, 2) these points [m].
+        normals: (M, 2) unit normals of the lines.
     """
 
     lines: FloatArray
     spans: IntArray
     own: IntArray
     points: FloatArray
+    normals: FloatArray
 
-    def of(self, chosen: NDArray[np.bool_]) -> "Surface":
-        """Those of some of the scan's points (N,)."""
-        some = chosen[self.own]
-        return Surface(self.lines[some], self.spans[some], self.own[some], self.points[some])
+    def extent(self, scanner: FloatArray) -> tuple[float, float, float]:
+        """Mean and greatest distance [m] of the points, at least one; and how squarely beams meet the lines.
 
-    @property
-    def normals(self) -> FloatArray:
-        """Unit normals (M, 2)."""
-        return np.ascontiguousarray(self.lines[:, 2:4])
+        Args:
+            scanner: x [m], y [m] of the scanner in the body.
+
+        Returns:
+            The third is the root of the mean square of the cosine between a beam and the normal.
+        """
+        return extent(self.points, self.normals, scanner)
 
 
-def surface(points: FloatArray, range_sigma: float) -> Surface:
-    """Lines through points (N, 2) [m] in the order of the beams, whose ranges have this noise [m]."""
-    lines, spans, own = fit_lines(points, LINE_REACH * range_sigma, range_sigma)
-    return Surface(lines, spans, own, points[own])
+def surface(points: FloatArray, range_sigma: float, wanted: NDArray[np.bool_] | None = None) -> Surface:
+    """Lines through points.
+
+    Args:
+        points: (N, 2) [m] in the order of the beams.
+        range_sigma: standard deviation of a range [m].
+        wanted: (N,) whose lines are asked for; None: all.
+    """
+    if wanted is None:
+        wanted = np.ones(len(points), dtype=np.bool_)
+    lines, spans, own = fit_lines(points, wanted, LINE_REACH * range_sigma, range_sigma)
+    return Surface(lines, spans, own, points.take(own, axis=0), np.ascontiguousarray(lines[:, 2:4]))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -178,8 +191,16 @@ class LineMap:
         )
         if matched < kernels.LEAST_MATCHED:
             return None
-        before, after = kernels.newest_information(prior), kernels.newest_information(information)
-        share = matched / len(found.points)
-        of_lines = index >= 0
-        by_pose = rows[of_lines, 1:4]
-        return Fit(states, information, before, after, held, keyframe_cov, share, of_lines, by_pose)
+        increment, cov = said_by_scan(
+            prior, information, held, keyframe_cov, predicted, states, LEAST_INFORMATION
+        )
+        return Fit(
+            states,
+            newest_covariance(information),
+            held,
+            increment,
+            cov,
+            matched / len(index),
+            rows,
+            index,
+        )

@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from estimators.geometry import transform
 from estimators.messages import FloatArray
 
 BLOCK = 64
@@ -85,22 +84,22 @@ class OccupancyGrid:
         Returns:
             False when the scan was left out: a number that is not finite, or cells too far away.
         """
-        ends = transform(T_map_lidar, points)
-        reached = np.vstack([T_map_lidar[:2], ends]) / self._cell
-        if not np.isfinite(reached).all():
+        ends, least, greatest = self._kernels.in_cells(T_map_lidar, np.ascontiguousarray(points), self._cell)
+        if not (np.isfinite(least).all() and np.isfinite(T_map_lidar).all()):
             return False
         # One cell more all round: counted from the corner, a point on a border may round into the next cell.
-        if not self._grow(np.floor(reached.min(axis=0)) - 1.0, np.floor(reached.max(axis=0)) + 1.0):
+        if not self._grow(np.floor(least) - 1.0, np.floor(greatest) + 1.0):
             return False
         self._scans += 1
-        reached -= self._corner
+        ends -= self._corner
+        x, y = T_map_lidar[:2] / self._cell - self._corner
         self._kernels.trace_scan(
             self._log_odds,
             self._seen,
             self._scans,
-            reached[0, 0],
-            reached[0, 1],
-            reached[1:],
+            x,
+            y,
+            ends,
             self._hit,
             self._miss,
             LIMIT,

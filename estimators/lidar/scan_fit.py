@@ -1,14 +1,12 @@
-"""Where the match of a scan begins, and what of its result the scan alone says."""
+"""Where the match of a scan begins, and what comes out of it."""
 
 from dataclasses import dataclass
 from itertools import product
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
-from estimators.geometry import wrap_angle
-from estimators.messages import FloatArray
+from estimators.messages import FloatArray, IntArray
 
 if TYPE_CHECKING:
     from estimators.lidar.line_map import LineMap, Surface
@@ -33,25 +31,23 @@ class Fit:
 
     Attributes:
         states: (12,) pose and velocity at the end of the scan before, and at the end of this one.
-        information: (12, 12) inverse of their covariance, the prior's included.
-        before: (3, 3) information on the newer pose alone, in the prior.
-        after: (3, 3) the same with the scan.
+        cov: (6, 6) of the newer pose and velocity, the prior included.
         held: (3, 3) projection of a change of the pose on what walls hold.
-        keyframe_cov: (3, 3) share of the map's own noise in the covariance of the newer pose.
+        increment: (3,) newer pose without what the motion model added.
+        increment_cov: (3, 3) of it.
         share: of the surface points that are matched.
-        matched: (N,) which of them.
-        by_pose: (M, 3) change of their distances from their lines with the pose at their instants.
+        rows: (N, 6) of the surface points, as `LineMap.match` gives them.
+        index: (N,) likewise.
     """
 
     states: FloatArray
-    information: FloatArray
-    before: FloatArray
-    after: FloatArray
+    cov: FloatArray
     held: FloatArray
-    keyframe_cov: FloatArray
+    increment: FloatArray
+    increment_cov: FloatArray
     share: float
-    matched: NDArray[np.bool_]
-    by_pose: FloatArray
+    rows: FloatArray
+    index: IntArray
 
 
 def search_start(
@@ -61,6 +57,7 @@ def search_start(
     predicted: FloatArray,
     doubt: FloatArray,
     dt: float,
+    greatest: float,
     reach: float,
 ) -> FloatArray:
     """States (12,) near which a match is looked for: the predicted ones, or what fits best round about.
@@ -75,16 +72,14 @@ def search_start(
         predicted: (12,) states.
         doubt: (3,) standard deviations of the newer pose.
         dt: time between the states [s].
+        greatest: distance of a point from the body [m].
         reach: how far a point may be off [m].
 
     Source: Olson, "Real-time correlative scan matching", ICRA 2009.
     """
-    if not len(found.points):
+    if 2.0 * max(doubt[0], doubt[1], doubt[2] * max(greatest, reach)) < reach:
         return predicted
-    distances = np.hypot(found.points[:, 0], found.points[:, 1])
-    if (2.0 * doubt * [1.0, 1.0, max(distances.max(), reach)] < reach).all():
-        return predicted
-    far = float(np.percentile(distances, 75))
+    far = float(np.percentile(np.hypot(found.points[:, 0], found.points[:, 1]), 75))
     steps = reach / np.array([1.0, 1.0, max(far, reach)])
     x, y, yaw = np.minimum(2.0 * doubt // steps, MOST_STEPS).astype(int)
     if not (x or y or yaw):
@@ -109,21 +104,3 @@ def search_start(
 
 def _size(offset: tuple[int, int, int]) -> int:
     return sum(step * step for step in offset)
-
-
-def said_by_scan(predicted: FloatArray, fit: Fit) -> tuple[FloatArray, FloatArray]:
-    """Newer pose (3,) and its covariance (3, 3) without what the motion model added.
-
-    Args:
-        predicted: (12,) states beforehand.
-        fit: what they became.
-
-    Source: Bar-Shalom et al., Tracking and Data Fusion, 9.5: tracklets by decorrelation.
-    """
-    # What walls hold tells of the rest by what the motion model thinks of both: that is not the scan's.
-    gained = fit.held @ (fit.after - fit.before) @ fit.held
-    cov = np.asarray(np.linalg.inv(gained + LEAST_INFORMATION * np.eye(3)), dtype=np.float64)
-    correction = cov @ fit.after @ (fit.states[NEWEST] - predicted[NEWEST])
-    pose = predicted[NEWEST] + correction @ fit.held
-    pose[2] = wrap_angle(pose[2])
-    return pose, cov + fit.keyframe_cov

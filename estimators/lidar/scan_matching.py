@@ -8,42 +8,26 @@ What goes out is what the scan says alone: the motion model's share is taken out
 again, and a direction that no wall holds comes out wide.
 """
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 from pydantic import Field
 
-from estimators.geometry import inverse, rotation, transform, transform_each
-from estimators.lidar.expectation import MotionNoise, expect
+from estimators.geometry import rotation, transform_each
 from estimators.lidar.known_motion import GyroTrack, OdometryTrack
-from estimators.lidar.scan_fit import NEWEST, UNKNOWN_SPEED_SIGMA, said_by_scan, search_start
+from estimators.lidar.scan_fit import UNKNOWN_SPEED_SIGMA, Fit, search_start
 from estimators.lidar.scan_preparation import LEAST_GAP_NS, PreparedScan, ScanPreparation
 from estimators.messages import FloatArray, ImuSample, Measurement, PoseIncrement, Scan
 from estimators.models.motion_settings import MotionInScans
 
 if TYPE_CHECKING:
-    from estimators.lidar.line_map import LineMap, Surface
+    from estimators.lidar.line_map import LineMap
 
 KEYFRAME_SHARE = 0.7
 """When a smaller share of the surface points is matched, too little of the keyframe is still in view."""
 
 _LEAST_VARIANCE = 1e-9
 """Of a pose [m^2, rad^2], so that no covariance is singular."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Match:
-    """A scan in place: both states (12,), covariance of the newer (6, 6), increment and its covariance.
-
-    The share is that of the surface points that are matched.
-    """
-
-    states: FloatArray
-    cov: FloatArray
-    increment: FloatArray
-    increment_cov: FloatArray
-    share: float
 
 
 class ScanMatcher:
@@ -89,12 +73,12 @@ class ScanMatcher:
             preparation: what is done with the points beforehand; by default what its Config says.
         """
         # Numba loads slowly: only who makes a matcher waits for it.
-        from estimators.lidar import line_map
+        from estimators.lidar import expectation, line_map
 
-        self._line_map = line_map
+        self._expectation, self._line_map = expectation, line_map
         self._config = config
         self._T_body_lidar = T_body_lidar
-        self._noise = MotionNoise(
+        self._noise = expectation.MotionNoise(
             config.accel_noise, config.yaw_accel_noise, config.bandwidth, config.gyro_sigma
         )
         self.odometry = OdometryTrack((config.accel_noise, config.yaw_accel_noise))
@@ -153,11 +137,11 @@ class ScanMatcher:
         self._keyframe = None
 
     def _observe(self, measurement: Measurement) -> None:
-        if isinstance(measurement, PoseIncrement):
-            self.odometry.add(measurement)
-        elif isinstance(measurement, ImuSample):
+        if isinstance(measurement, ImuSample):
             if self._noise.gyro_sigma:
                 self._gyro.add(measurement)
+        elif isinstance(measurement, PoseIncrement):
+            self.odometry.add(measurement)
         else:
             self._preparation.observe(measurement)
 
@@ -201,57 +185,42 @@ class ScanMatcher:
             or abs(self._state[2]) > np.deg2rad(self._config.keyframe_angle_deg)
         )
 
-    def _match(self, scan: PreparedScan, keyframe: "LineMap") -> _Match | None:
+    def _match(self, scan: PreparedScan, keyframe: "LineMap") -> Fit | None:
         """Put a scan where it fits; leaves the deskewed points in `points` when it does."""
         config = self._config
         dt = (scan.stamp_ns - self._stamp_ns) * 1e-9
-        expected = expect(
+        expected = self._expectation.expect(
             scan, self._stamp_ns, self._state, self._cov, self._noise, self.odometry, self._gyro
         )
         # Lines go through all points; by count, what is near the scanner would outweigh the room.
-        found = self._line_map.surface(expected.points, config.range_sigma).of(scan.apart)
-        basis = expected.basis[found.own]
-        F, Q = expected.F, expected.Q
-        motion = np.hstack([-F, np.eye(6)])
-        prior = motion.T @ np.linalg.solve(Q, motion)
-        prior[:6, :6] += np.linalg.inv(expected.cov)
-        predicted = np.concatenate([expected.state, F @ expected.state])
-        doubt = np.sqrt(np.diag(F @ expected.cov @ F.T + Q)[:3])
-        start = search_start(keyframe, found, basis, predicted, doubt, dt, config.max_correspondence)
-        far = np.hypot(found.points[:, 0], found.points[:, 1]).mean() if len(found.points) else 0.0
-        spread = min(2.0 * float(max(doubt[0], doubt[1], doubt[2] * far)), config.max_correspondence)
-        sigma = self._ranges_to_walls(found)
+        found = self._line_map.surface(expected.points, config.range_sigma, scan.apart)
+        if not len(found.points):
+            return None
+        basis = expected.basis.take(found.own, axis=0)
+        prior, predicted, doubt = expected.prior()
+        mean, greatest, squarely = found.extent(self._T_body_lidar)
+        start = search_start(
+            keyframe, found, basis, predicted, doubt, dt, greatest, config.max_correspondence
+        )
+        spread = min(2.0 * float(max(doubt[0], doubt[1], doubt[2] * mean)), config.max_correspondence)
+        # A wall is as far off as the part of a range says that is square to it.
+        sigma = config.range_sigma * squarely
         fit = keyframe.settle(found, basis, prior, predicted, start, sigma, spread)
         if fit is None:
             return None
         # A bare wall looks the same everywhere, and half of a room like half of it turned round: after a long
         # gap it is only known to be the one when all fits.
-        has_wandered = float(np.sqrt(Q[0, 0])) > config.max_correspondence
+        has_wandered = float(np.sqrt(expected.Q[0, 0])) > config.max_correspondence
         least_share = max(config.min_inlier_share, KEYFRAME_SHARE * has_wandered)
         is_another = has_wandered and np.linalg.matrix_rank(fit.held, tol=0.5) < 3
         if fit.share < least_share or is_another:
             return None
 
-        states = fit.states
-        in_keyframe = transform_each(expected.basis @ states.reshape(4, 3), expected.points)
-        self.points = transform(inverse(states[NEWEST]), in_keyframe)
-        increment, cov = said_by_scan(predicted, fit)
-        bent = expected.bent(1.0 + scan.times[found.own][fit.matched] / dt, fit.by_pose)
-        states[9:11] += rotation(states[8]) @ expected.twist[:2]
-        states[11] += expected.twist[2]
-        velocity = states[9:]
-        cov += (1e-3 * config.stamp_sigma_ms) ** 2 * np.outer(velocity, velocity)
-        cov += bent
-        cov_of_state = np.linalg.inv(fit.information)[6:, 6:]
-        cov_of_state[:3, :3] += bent
-        return _Match(
-            states, 0.5 * (cov_of_state + cov_of_state.T), increment, 0.5 * (cov + cov.T), fit.share
-        )
-
-    def _ranges_to_walls(self, found: "Surface") -> float:
-        """Standard deviation [m] of a distance from a wall: the part of a range's that is square to it."""
-        if not len(found.points):
-            return self._config.range_sigma
-        beams = found.points - self._T_body_lidar[:2]
-        square = (beams * found.normals).sum(axis=1) ** 2 / (beams**2).sum(axis=1)
-        return self._config.range_sigma * float(np.sqrt(square.mean()))
+        self.points = expected.seen_from_end(fit.states)
+        bent = expected.bent(found.own, fit.rows, fit.index)
+        velocity, cov = fit.states[9:], fit.increment_cov
+        velocity[:2] += rotation(fit.states[8]) @ expected.twist[:2]
+        velocity[2] += expected.twist[2]
+        cov += (1e-3 * config.stamp_sigma_ms) ** 2 * np.outer(velocity, velocity) + bent
+        fit.cov[:3, :3] += bent
+        return fit

@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from estimators.geometry import transform, wrap_angles
 from estimators.messages import Attitude, FloatArray, Measurement, Scan
 
 LEAST_GAP_NS = 1_000_000
@@ -76,6 +75,10 @@ class ScanPreparation:
             config: settings.
             T_body_lidar: (3,) mounting of the lidar in the body: x [m], y [m], yaw [rad].
         """
+        # Numba loads slowly: only who prepares scans waits for it.
+        from estimators.kernels.scan_points import returns
+
+        self._returns = returns
         self._config = config
         self._T_body_lidar = T_body_lidar
         self._attitude: Attitude | None = None
@@ -87,17 +90,17 @@ class ScanPreparation:
 
     def prepare(self, scan: Scan) -> PreparedScan:
         """The returns of a scan that are good for anything."""
-        config = self._config
-        with np.errstate(invalid="ignore"):
-            good = (scan.ranges > 0.0) & (scan.ranges >= config.min_range) & (scan.ranges <= config.max_range)
-        good &= np.isfinite(scan.angles)
-        kept = np.flatnonzero(good)
-        kept = kept[:: -(-len(kept) // config.max_points) or 1]
-        apart = _spread(scan.angles[kept], scan.ranges[kept], config.spacing)
-        angles, ranges, stamp_ns = scan.angles[kept], scan.ranges[kept], scan.end_stamp_ns
-        in_lidar = np.column_stack([ranges * np.cos(angles), ranges * np.sin(angles)])
-        points = transform(self._T_body_lidar, in_lidar)
-        times = scan.beam_times[kept] - (scan.beam_times[-1] if len(scan.beam_times) else 0.0)
+        config, stamp_ns = self._config, scan.end_stamp_ns
+        points, times, apart = self._returns(
+            np.ascontiguousarray(scan.angles),
+            np.ascontiguousarray(scan.ranges),
+            np.ascontiguousarray(scan.beam_times),
+            self._T_body_lidar,
+            config.min_range,
+            config.max_range,
+            config.max_points,
+            config.spacing,
+        )
         if config.level and self._attitude is not None:
             age = abs(stamp_ns - self._attitude.stamp_ns) * 1e-9
             if age <= MOST_ATTITUDE_AGE:
@@ -105,15 +108,6 @@ class ScanPreparation:
                 near = np.abs(level[:, 2]) <= config.max_rise
                 points, times, apart = np.ascontiguousarray(level[near, :2]), times[near], apart[near]
         return PreparedScan(stamp_ns, points, times, apart)
-
-
-def _spread(angles: FloatArray, ranges: FloatArray, spacing: float) -> NDArray[np.bool_]:
-    """Which of N beams to keep, so that where they end there is at least about so much between them [m]."""
-    if spacing == 0.0:
-        return np.ones(len(angles), dtype=np.bool_)
-    # Square to the beams: the noise of ranges is none.
-    way = np.cumsum(np.abs(wrap_angles(np.diff(angles, prepend=angles[:1]))) * ranges)
-    return np.diff(np.floor(way / spacing), prepend=-1.0) > 0.0
 
 
 def _tilt(quat_wxyz: FloatArray) -> FloatArray:

@@ -6,7 +6,7 @@ from math import cos, hypot, log, sin, sqrt
 import numpy as np
 
 from estimators.base import Setup
-from estimators.geometry import between, compose, transform_each
+from estimators.geometry import between, compose
 from estimators.lidar.occupancy_grid import OccupancyGrid
 from estimators.messages import FloatArray, Measurement, PoseEstimate, PoseIncrement, Scan
 
@@ -36,6 +36,10 @@ class Visibility:
     """
 
     def __init__(self, obstacle_height: float, setup: Setup) -> None:
+        # Numba loads slowly: only who looks waits for it.
+        from estimators.kernels.scan_points import ends_of_beams
+
+        self._ends_of_beams = ends_of_beams
         self._obstacle_height = obstacle_height
         self._arm = setup.tag_in_body.tolist()
         self._setup = setup
@@ -104,9 +108,10 @@ class Visibility:
             return
         mounting = self._setup.lidar_in_body
         T_map_first, T_map_last = (compose(np.array([*p.xy, p.yaw]), mounting) for p in (begin, end))
-        returned = np.isfinite(scan.ranges) & (scan.ranges > 0.0)
-        ranges, angles = scan.ranges[returned], scan.angles[returned]
-        points = np.column_stack([ranges * np.cos(angles), ranges * np.sin(angles)])
-        to_go = 1.0 - scan.beam_times[returned] / scan.beam_times[-1]
-        T_last_beam = to_go[:, None] * between(T_map_last, T_map_first)
-        self.grid.insert(T_map_last, transform_each(T_last_beam, points))
+        ends = self._ends_of_beams(
+            np.ascontiguousarray(scan.angles),
+            np.ascontiguousarray(scan.ranges),
+            np.ascontiguousarray(scan.beam_times),
+            between(T_map_last, T_map_first),
+        )
+        self.grid.insert(T_map_last, ends)

@@ -2,10 +2,13 @@
 
 import numpy as np
 import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
 
 from estimators.base import Verdict
 from estimators.ekf import Ekf
 from estimators.geometry import compose
+from estimators.lidar.keyframes import is_covariance
 from estimators.lidar.odometry import LidarOdometry
 from estimators.messages import FloatArray, PoseIncrement
 from tests.strategies import SETUP, range_frame
@@ -81,3 +84,27 @@ def test_the_ekf_without_ranges_is_lidar_odometry() -> None:
         tight.update(increment)
     for actual, expected in zip(alone.state, tight.state, strict=True):
         np.testing.assert_array_equal(actual, expected)
+
+
+@given(
+    st.lists(st.floats(-1.0, 1.0), min_size=9, max_size=9),
+    st.lists(st.floats(-1.0, 1.0), min_size=3, max_size=3),
+)
+def test_a_covariance_is_what_has_positive_eigenvalues(entries: list[float], values: list[float]) -> None:
+    axes, _ = np.linalg.qr(np.array(entries).reshape(3, 3) + 3.0 * np.eye(3))
+    # Rounding tells of a matrix that is hardly regular.
+    assume(min(map(abs, values)) > 1e-6)
+    matrix = axes @ np.diag(values) @ axes.T
+    assert is_covariance(0.5 * (matrix + matrix.T)) == (min(values) > 0.0)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("place", range(9))
+def test_what_is_not_finite_is_no_covariance(place: int, bad: float) -> None:
+    cov = np.eye(3) + 0.1
+    assert is_covariance(cov)
+    cov.flat[place] = bad
+    assert not is_covariance(cov)
+    cov[:] = np.eye(3)
+    cov.flat[place] = bad
+    assert not is_covariance(cov)
