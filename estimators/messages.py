@@ -46,6 +46,9 @@ class Scan:
         ranges: (N,) float64 [m]; 0 where nothing came back.
         beam_times: (N,) float64 [s] after ``stamp_ns``, ascending.
         quality: (N,) float64, the device's own strength of return, 0 where it gives none.
+
+    Raises:
+        ValueError: the columns differ in length; kernels would read past the end of the shortest.
     """
 
     stamp_ns: int
@@ -53,6 +56,11 @@ class Scan:
     ranges: FloatArray
     beam_times: FloatArray
     quality: FloatArray
+
+    def __post_init__(self) -> None:
+        """Refuse columns of different lengths."""
+        if not len(self.angles) == len(self.ranges) == len(self.beam_times) == len(self.quality):
+            raise ValueError("scan: angles, ranges, beam_times and quality are not equally long")
 
     @property
     def end_stamp_ns(self) -> int:

@@ -88,3 +88,9 @@ def test_of_near_returns_those_are_told_that_are_a_spacing_apart(distance: float
     assert len(prepared.points) == 360
     assert prepared.apart.sum() == pytest.approx(360 / between, rel=0.08)
     assert preparation(spacing=0.0).prepare(scan_of(noisy)).apart.all()
+
+
+def test_a_scan_has_columns_of_one_length() -> None:
+    column = np.zeros(3)
+    with pytest.raises(ValueError, match="not equally long"):
+        Scan(0, column, column[:2], column, column)
