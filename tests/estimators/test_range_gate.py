@@ -10,7 +10,7 @@ from estimators import estimator_config_class, make_estimator
 from estimators.base import Setup, Start, Verdict
 from estimators.messages import FloatArray, PoseIncrement, RangeFrame
 from estimators.nlos.visibility import OBSTRUCTED, Visibility
-from estimators.range_gate import Candidate, NlosMethod, RangeGate
+from estimators.range_gate import NlosMethod, RangeGate
 from tests.estimators.matched_world import HALL, true_ranges
 from tests.strategies import range_frame
 
@@ -37,9 +37,8 @@ def frame_at(k: int, excess: FloatArray, difference: float | FloatArray = NO_POW
 
 def judged(of: RangeGate, k: int, residual: float, difference: float = NO_POWER) -> Verdict:
     """Verdict on the first range of a frame."""
-    candidate = of.candidates(frame_at(k, np.zeros(4), difference), POSE, 0.0)[0]
-    assert isinstance(candidate, Candidate)
-    verdict, _ = of.judge(candidate, residual, (residual / EXPECTED_SIGMA) ** 2)
+    candidates = of.horizontal.of(frame_at(k, np.zeros(4), difference), POSE, 0.0)
+    verdict, _ = of.judge(candidates, 0, residual, (residual / EXPECTED_SIGMA) ** 2)
     return verdict
 
 
@@ -140,9 +139,8 @@ def test_robust_uses_every_range_that_is_not_too_short_but_counts_the_long_ones_
     soft = gate("robust")
     factors = []
     for k, residual in enumerate((0.0, 0.2, 0.4, 2.0)):
-        candidate = soft.candidates(frame_at(k, np.zeros(4)), POSE, 0.0)[0]
-        assert isinstance(candidate, Candidate)
-        verdict, factor = soft.judge(candidate, residual, (residual / EXPECTED_SIGMA) ** 2)
+        candidates = soft.horizontal.of(frame_at(k, np.zeros(4)), POSE, 0.0)
+        verdict, factor = soft.judge(candidates, 0, residual, (residual / EXPECTED_SIGMA) ** 2)
         assert verdict is (Verdict.DOWNWEIGHTED if residual >= 0.4 else Verdict.ACCEPTED)
         factors.append(factor)
     assert factors == sorted(factors)
@@ -175,7 +173,50 @@ def test_what_is_no_range_says_what_is_wrong() -> None:
         ranges=np.array([np.nan, -3.0, 0.5, 5.0]),
     )
     wrong = Verdict.IMPOSSIBLE
-    assert gate("prediction").candidates(bad, POSE, 0.0) == [wrong, wrong, wrong, Verdict.UNKNOWN_ANCHOR]
+    candidates = gate("prediction").horizontal.of(bad, POSE, 0.0)
+    assert candidates.verdicts == [wrong, wrong, wrong, Verdict.UNKNOWN_ANCHOR]
+    assert np.isinf(candidates.rows[:, 3]).all()
+    report = gate("prediction").judge_together(candidates, np.zeros(4), np.eye(4))
+    assert list(report.verdicts) == candidates.verdicts
+    assert np.isnan([report.residuals, report.nis]).all()
+
+
+@pytest.mark.parametrize("methods", [(), ("prediction", "power", "visibility"), ("robust", "visibility")])
+def test_what_is_judged_together_is_judged_as_by_a_kalman_filter_one_by_one(
+    methods: tuple[NlosMethod, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    obstruct(monkeypatch)
+    rng = np.random.default_rng(6)
+    together, alone = gate(*methods), gate(*methods)
+    given: set[Verdict] = set()
+    for k in range(200):
+        frame = frame_at(k, np.zeros(4), rng.choice([CLEAR, WEAK], 4))
+        frame = replace(frame, anchor_ids=np.where(rng.random(4) < 0.1, 99, frame.anchor_ids))
+        root = 0.1 * rng.standard_normal((4, 4))
+        mean = root @ rng.standard_normal(4) + SIGMA * rng.standard_normal(4) + 0.5 * (rng.random(4) < 0.2)
+        cov = root @ root.T
+        candidates = together.horizontal.of(frame, POSE, 0.0)
+        report = together.judge_together(candidates, mean.copy(), cov.copy())
+        state, spread = np.zeros(4), cov
+        singles = alone.horizontal.of(frame, POSE, 0.0)
+        for i, verdict in enumerate(singles.verdicts):
+            if verdict is not Verdict.WAITING:
+                assert report.verdicts[i] is verdict
+                continue
+            H, sigma = np.eye(4)[i], singles.rows[i, 3]
+            residual = mean[i] - state[i]
+            nis = residual**2 / (spread[i, i] + sigma**2)
+            expected, factor = alone.judge(singles, i, residual, nis)
+            given.add(expected)
+            assert report.verdicts[i] is expected
+            assert report.residuals[i] == pytest.approx(residual, abs=1e-12)
+            assert report.nis[i] == pytest.approx(nis, rel=1e-9)
+            assert candidates.rows[i, 3] == pytest.approx(factor * sigma if expected.is_used else np.inf)
+            if expected.is_used:
+                gain = spread @ H / (spread[i, i] + (factor * sigma) ** 2)
+                state = state + gain * residual
+                spread = spread - np.outer(gain, H @ spread)
+    assert len(given) >= 3 if methods else given == {Verdict.ACCEPTED, Verdict.GATED}
 
 
 FILTERS = ["ekf", "graph", "pf", "pf_ibas", "pf_ibas_graph"]
