@@ -90,7 +90,7 @@ def note(
     own[MEAN] += share * (min(max(residual, -bound), bound) - own[MEAN])
     own[BY_POSE] += share * (max(variance - sigma**2, 0.0) - own[BY_POSE])
     if own[COUNT] < LEAST:
-        return at[AGREES_SINCE_NS] == NEVER
+        return bool(at[AGREES_SINCE_NS] == NEVER)
     witnesses, count, left_out = np.empty(len(residuals)), 0, 0
     for i in range(len(residuals)):
         if heard[i, AGREES_SINCE_NS] != NEVER:
@@ -114,4 +114,4 @@ def note(
         at[TIMES] += 1
     if stamp_ns - common[AGREE_SINCE_NS] > PROBATION * 1e9:
         common[HAVE_AGREED] = 1
-    return at[AGREES_SINCE_NS] == NEVER
+    return bool(at[AGREES_SINCE_NS] == NEVER)
