@@ -73,13 +73,16 @@ class HorizontalRanges:
                 if anchor_id in setup.anchors:
                     longer, slopes[i] = bias.at(pose, setup.anchors[anchor_id], arm, yaw_variance)
                     slants[i] -= longer
-        anchors, rows = kernels.reduced(
+        anchors, rows = np.empty(len(slants), dtype=np.int64), np.zeros((len(slants), 4))
+        kernels.reduce_heights(
             np.ascontiguousarray(frame.anchor_ids),
             np.ascontiguousarray(slants),
             self._ids,
             self._site,
             float(arm[2] - setup.tag_in_body[2]),
             self._sigma,
+            anchors,
+            rows,
         )
         if bias is not None:
             usable = anchors >= 0

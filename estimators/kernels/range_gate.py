@@ -52,15 +52,17 @@ MIN_HORIZONTAL_RANGE = 0.05
 """As of `models.range`."""
 
 
-@compiled(f"Tuple(({INDICES}, {MATRIX}))({INDICES}, {VECTOR}, {INDICES}, {MATRIX}, float64, float64)")
-def reduced(
+@compiled(f"void({INDICES}, {VECTOR}, {INDICES}, {MATRIX}, float64, float64, {INDICES}, {MATRIX})")
+def reduce_heights(
     anchor_ids: IntArray,
     slants: FloatArray,
     site_ids: IntArray,
     site: FloatArray,
     lift: float,
     sigma: float,
-) -> tuple[IntArray, FloatArray]:
+    anchors: IntArray,
+    rows: FloatArray,
+) -> None:
     """Height reduction of a frame's ranges, as `models.range.reduce_height` does it.
 
     Args:
@@ -70,29 +72,24 @@ def reduced(
         site: (A, 3) their x [m] and y [m], map frame, and height above the first tag [m].
         lift: height of the tag above the first one [m].
         sigma: standard deviation of a distance [m].
-
-    Returns:
-        Number (N,) of each anchor among the known ones, or `IMPOSSIBLE` or `UNKNOWN_ANCHOR`; rows (N, 4) of
-        ranges, of infinite sigma where they are good for nothing.
+        anchors: (N,) filled in with each one's number among the known, `IMPOSSIBLE` or `UNKNOWN_ANCHOR`.
+        rows: (N, 4) zeros, filled in with the ranges; of infinite sigma where they are good for nothing.
 
     Source: huang2024 Eq. (3).
     """
-    count = len(anchor_ids)
-    numbers, rows = np.full(count, UNKNOWN_ANCHOR), np.zeros((count, 4))
-    for i in range(count):
-        rows[i, 3] = np.inf
+    for i in range(len(anchor_ids)):
+        anchors[i], rows[i, 3] = UNKNOWN_ANCHOR, np.inf
         for k in range(len(site_ids)):
             if site_ids[k] == anchor_ids[i]:
                 height = site[k, 2] - lift
                 square = slants[i] * slants[i] - height * height
-                numbers[i] = IMPOSSIBLE
+                anchors[i] = IMPOSSIBLE
                 if isfinite(square) and slants[i] > 0.0 and square >= MIN_HORIZONTAL_RANGE**2:
-                    numbers[i] = k
+                    anchors[i] = k
                     rows[i, 0], rows[i, 1] = site[k, 0], site[k, 1]
                     rows[i, 2] = sqrt(square)
                     rows[i, 3] = sigma * slants[i] / rows[i, 2]
                 break
-    return numbers, rows
 
 
 @compiled("int64(float64, float64, float64)")
@@ -197,10 +194,10 @@ def judge_together(
         state: as of `judged`.
         settings: likewise.
         stamp_ns: when they were measured.
-        anchors: (N,) numbers of `reduced`.
+        anchors: (N,) numbers of `reduce_heights`.
         rx_power: (N,) [dBm].
         fp_power: (N,) [dBm].
-        rows: (N, 4) of `reduced`; in place, their sigmas become those they are used with, infinite without.
+        rows: (N, 4) of `reduce_heights`; their sigmas become those they are used with, infinite without.
         mean: (N,) measured minus predicted [m], corrected in place.
         cov: (N, N) of the predictions [m^2], likewise.
         codes: (N,) verdicts, filled in.

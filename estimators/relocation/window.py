@@ -216,9 +216,13 @@ class Window:
 
 def _drift(tags: FloatArray, steps: IntArray, ends: FloatArray, covs: FloatArray) -> FloatArray:
     """Variance (N,) along one axis of each tag's place, as far as steps since then have added to it [m^2]."""
-    shift = np.concatenate([[0.0], np.cumsum(0.5 * (covs[:, 0, 0] + covs[:, 1, 1]))])
-    apart = tags - ends[:, None]
-    turned = 0.5 * covs[:, 2, 2, None] * (apart[:, :, 0] ** 2 + apart[:, :, 1] ** 2)
-    older = steps > np.arange(len(ends))[:, None]
-    total: FloatArray = shift[steps] + (turned * older).sum(axis=0)
+    # The turn of a step moves a tag by its distance from the step's end; its square is written out.
+    turned, (x, y) = 0.5 * covs[:, 2, 2], ends.T
+    shifted = 0.5 * (covs[:, 0, 0] + covs[:, 1, 1])
+    sums = np.zeros((len(covs) + 1, 4))
+    np.cumsum(
+        np.column_stack([shifted + turned * (x * x + y * y), turned, turned * x, turned * y]), 0, out=sums[1:]
+    )
+    (constant, square, by_x, by_y), (x, y) = sums[steps].T, tags.T
+    total: FloatArray = constant + square * (x * x + y * y) - 2.0 * (by_x * x + by_y * y)
     return total
