@@ -27,7 +27,7 @@ _SUREST = 20.0
 _GREATEST = 100.0
 """A sigma that is so many times larger leaves nothing of a range."""
 _TAIL = -30.0
-"""Below this `erfc` comes near the smallest numbers; the series of the tail is exact to 1e-12."""
+"""Below this `erfc` comes near the smallest numbers; the series of the tail is right to 1e-12 there."""
 _LOG_ROOT_TAU = 0.5 * log(tau)
 
 
@@ -78,7 +78,7 @@ def log_normal_share(x: float) -> float:
     if x > _TAIL:
         return log(0.5 * erfc(-x * sqrt(0.5)))
     small = 1.0 / (x * x)
-    series = 1.0 - small * (1.0 - 3.0 * small * (1.0 - 5.0 * small * (1.0 - 7.0 * small)))
+    series = 1.0 - small * (1.0 - 3.0 * small * (1.0 - 5.0 * small))
     return -0.5 * x * x - log(-x) - _LOG_ROOT_TAU + log(series)
 
 

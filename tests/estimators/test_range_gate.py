@@ -63,6 +63,13 @@ def test_a_range_that_is_too_long_is_named_so_and_its_anchor_remembered() -> Non
     assert judged(remembering, 200, 0.0) is Verdict.ACCEPTED
 
 
+def test_a_reset_forgets_who_was_blocked() -> None:
+    remembering = gate("prediction")
+    assert judged(remembering, 0, 0.4) is Verdict.TOO_LONG
+    remembering.reset()
+    assert judged(remembering, 1, 0.0) is Verdict.ACCEPTED
+
+
 def test_an_anchor_that_was_long_clear_is_not_doubted_for_one_outlier() -> None:
     remembering = gate("prediction")
     for k in range(50):
