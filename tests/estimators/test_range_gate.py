@@ -5,10 +5,13 @@ from itertools import permutations
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from estimators import estimator_config_class, make_estimator
 from estimators.base import Setup, Start, Verdict
 from estimators.messages import FloatArray, PoseIncrement, RangeFrame
+from estimators.models.range import reduce_height
 from estimators.nlos.visibility import OBSTRUCTED, Visibility
 from estimators.range_gate import NlosMethod, RangeGate
 from tests.estimators.matched_world import HALL, true_ranges
@@ -224,6 +227,30 @@ def test_what_is_judged_together_is_judged_as_by_a_kalman_filter_one_by_one(
                 state = state + gain * residual
                 spread = spread - np.outer(gain, H @ spread)
     assert len(given) >= 3 if methods else given == {Verdict.ACCEPTED, Verdict.GATED}
+
+
+@given(st.floats(-1.0, 20.0) | st.just(np.nan), st.floats(0.0, 6.0), st.floats(-1.0, 1.0))
+def test_ranges_are_reduced_as_the_model_does(slant: float, height: float, lift: float) -> None:
+    arm = HALL.tag_in_body + np.array([0.0, 0.0, lift])
+    anchor = np.array([4.0, 2.0, HALL.height + HALL.tag_in_body[2] + height])
+    setup = replace(HALL, anchors={5: anchor}, tags={2: arm})
+    frame = replace(range_frame(0, [5], [slant]), tag_id=2)
+    candidates = RangeGate(RangeGate.Config(range_sigma=SIGMA), setup).horizontal.of(frame, POSE, 0.0)
+    expected = reduce_height(slant, SIGMA, setup.height_to(anchor) - lift)
+    if expected is None:
+        assert candidates.verdicts == [Verdict.IMPOSSIBLE]
+    else:
+        np.testing.assert_allclose(candidates.rows, [[4.0, 2.0, *expected]], rtol=1e-9)
+
+
+def test_columns_of_a_table_are_ranges_like_any_others() -> None:
+    frame = frame_at(0, np.array([0.0, 0.9, 0.0, 0.0]), CLEAR)
+    table = np.column_stack([frame.ranges, frame.rx_power, frame.fp_power])
+    strided = RangeFrame(0, frame.tag_id, np.repeat(frame.anchor_ids, 2)[::2], *table.T)
+    config = estimator_config_class("pf_ibas").model_validate({})
+    reports = [make_estimator("pf_ibas", config, SURE).update(each) for each in (frame, strided)]
+    assert reports[0].verdicts == reports[1].verdicts
+    np.testing.assert_array_equal(reports[0].residuals, reports[1].residuals)
 
 
 FILTERS = ["ekf", "graph", "pf", "pf_ibas", "pf_ibas_graph"]
