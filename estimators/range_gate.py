@@ -217,11 +217,9 @@ class RangeGate:
         """
         frame, count = candidates.frame, len(mean)
         codes, report = np.empty(count, dtype=np.int64), np.full((3, count), np.nan)
-        k = -1
-        while k < count:
-            if k >= 0:
-                report[2, k] = self._look(candidates, k)
-            k = self._kernels.judge_together(
+        begin = 0
+        while True:
+            begin = self._kernels.judge_together(
                 self._state,
                 self._settings,
                 frame.stamp_ns,
@@ -233,8 +231,11 @@ class RangeGate:
                 cov,
                 codes,
                 report,
-                max(k, 0),
+                begin,
             )
+            if begin == count:
+                break
+            report[2, begin] = self._look(candidates, begin)
         verdicts = tuple([self._kernels.VERDICTS[code] for code in codes.tolist()])
         return Report(verdicts, report[0], report[1])
 
