@@ -36,24 +36,19 @@ class Ekf(FixTaker, LidarOdometry):
         self._gate.reset()
 
     def _update_ranges(self, frame: RangeFrame) -> Report:
-        count = len(frame.ranges)
-        verdicts = [Verdict.ACCEPTED] * count
-        residuals, nis = np.full(count, np.nan), np.full(count, np.nan)
-        yaw_variance = float(self._filter.P[2, 2])
-        for i, candidate in enumerate(self._gate.candidates(frame, self._filter.x[POSE], yaw_variance)):
-            if isinstance(candidate, Verdict):
-                verdicts[i] = candidate
+        residuals, nis = np.full((2, len(frame.ranges)), np.nan)
+        candidates = self._gate.horizontal.of(frame, self._filter.x[POSE], float(self._filter.P[2, 2]))
+        verdicts, arm = candidates.verdicts, self._setup.arm(frame.tag_id)
+        for i, (x, y, measured, sigma) in enumerate(candidates.rows.tolist()):
+            if verdicts[i] is not Verdict.WAITING:
                 continue
-            measured, sigma = candidate.measured, candidate.sigma
-            predicted, by_pose = horizontal_range(
-                self._filter.x[POSE], candidate.anchor, self._setup.arm(frame.tag_id)
-            )
+            predicted, by_pose = horizontal_range(self._filter.x[POSE], (x, y), arm)
             H = np.zeros((1, 9))
-            H[0, POSE] = by_pose + candidate.bias_by_pose
+            H[0, POSE] = by_pose + candidates.bias_by_pose[i]
             variance = float((H @ self._filter.P @ H.T).item()) + sigma**2
             residuals[i] = measured - predicted
             nis[i] = residuals[i] ** 2 / variance
-            verdicts[i], factor = self._gate.judge(candidate, residuals[i], nis[i])
+            verdicts[i], factor = self._gate.judge(candidates, i, residuals[i], nis[i])
             if verdicts[i].is_used:
                 self._correct(residuals[i : i + 1], H, np.array([[(factor * sigma) ** 2]]))
         return Report(tuple(verdicts), residuals, nis)

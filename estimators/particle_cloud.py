@@ -24,7 +24,7 @@ from estimators.messages import (
     PoseIncrement,
     RangeFrame,
 )
-from estimators.range_gate import Candidate, RangeGate
+from estimators.range_gate import RangeGate
 
 POSE, VELOCITY, KEYFRAME = slice(0, 3), slice(3, 6), slice(6, 9)
 _NO_RANGES, _NO_LANDMARKS = np.empty((0, 4)), np.empty((0, 6))
@@ -156,41 +156,15 @@ class ParticleCloud(FixTaker):
         self._particles[:, KEYFRAME] = self._particles[:, POSE]
 
     def _update_ranges(self, frame: RangeFrame) -> Report:
-        count = len(frame.ranges)
-        verdicts = [Verdict.ACCEPTED] * count
-        innovations, nis = np.full(count, np.nan), np.full(count, np.nan)
-        candidates: list[tuple[int, Candidate]] = []
         pose, spread = self._cloud.moments(self._particles, self._weights, 3)
-        for i, item in enumerate(self._gate.candidates(frame, pose, spread[2, 2])):
-            if isinstance(item, Verdict):
-                verdicts[i] = item
-            else:
-                candidates.append((i, item))
-        if not candidates:
-            return Report(tuple(verdicts), innovations, nis)
+        candidates = self._gate.horizontal.of(frame, pose, spread[2, 2])
         arm = self._setup.arm(frame.tag_id)
-        ranges = np.array([(c.anchor[0], c.anchor[1], c.measured, c.sigma) for _, c in candidates])
-        expected = self._likelihood.expected_residuals(self._particles, self._weights, arm, ranges)
-        # In plain floats: arrays of a few numbers take longer than all of the arithmetic.
-        mean, cov = expected[0].tolist(), expected[1].tolist()
-        for k, (i, candidate) in enumerate(candidates):
-            known = cov[k]
-            innovations[i] = mean[k]
-            nis[i] = square = mean[k] ** 2 / (known[k] + candidate.sigma**2)
-            verdicts[i], factor = self._gate.judge(candidate, mean[k], square)
-            if not verdicts[i].is_used:
-                ranges[k, 3] = np.inf
-                continue
-            # What is used corrects the expectation of those after it, as in a Kalman filter.
-            ranges[k, 3] = sigma = factor * candidate.sigma
-            for j in range(k + 1, len(candidates)):
-                gain = cov[j][k] / (known[k] + sigma**2)
-                mean[j] -= gain * mean[k]
-                cov[j] = [value - gain * other for value, other in zip(cov[j], known, strict=True)]
-        if any(verdict.is_used for verdict in verdicts):
-            fixes = Fixes(self._likelihood.misfits, arm, ranges, _NO_LANDMARKS)
+        expected = self._likelihood.expected_residuals(self._particles, self._weights, arm, candidates.rows)
+        report = self._gate.judge_together(candidates, *expected)
+        if any(verdict.is_used for verdict in report.verdicts):
+            fixes = Fixes(self._likelihood.misfits, arm, candidates.rows, _NO_LANDMARKS)
             self._take(fixes(self._particles), fixes)
-        return Report(tuple(verdicts), innovations, nis)
+        return report
 
     def _update_landmarks(self, frame: LandmarkFrame) -> Verdict:
         landmarks = self._landmark_gate.usable(frame)

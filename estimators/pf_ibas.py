@@ -65,21 +65,23 @@ class PfIbas(ParticleFilter):
         super().__init__(config, setup)
 
     def _take(self, misfits: FloatArray, measured: Likelihood) -> None:
-        if not (isinstance(measured, Fixes) and self._sample_posterior(misfits, measured)):
-            super()._take(misfits, measured)
+        if isinstance(measured, Fixes):
+            weights = self._weights.copy()
+            enough = self._resample_below * len(weights)
+            if self._likelihood.temper(weights, misfits, 1.0, enough) == 1.0:
+                self._weights = weights
+                return
+            if self._sample_posterior(measured, enough):
+                return
+        super()._take(misfits, measured)
 
-    def _sample_posterior(self, misfits: FloatArray, measured: Fixes) -> bool:
-        """Take new particles if too few of the old ones would keep any weight, and enough new ones have."""
-        count, before = len(self._weights), self._weights
-        enough = self._resample_below * count
-        weights = before.copy()
-        self._likelihood.temper(weights, misfits, 1.0, 0.0)
-        if 1.0 / float(weights @ weights) >= enough:
-            return False
+    def _sample_posterior(self, measured: Fixes, enough: float) -> bool:
+        """Take new particles if their effective sample size is at least `enough`."""
+        count = len(self._weights)
         particles, weights, served = self._posterior.sample(
             self._particles,
-            before,
-            self._indices(before, count, self._rng),
+            self._weights,
+            self._indices(self._weights, count, self._rng),
             measured.arm,
             measured.ranges,
             measured.landmarks,

@@ -2,55 +2,40 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from math import sqrt
-from typing import Literal, TypeAlias
+from typing import Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from estimators import chi2
 from estimators.anchor_trust import AnchorTrust
-from estimators.base import Setup, Verdict
-from estimators.messages import FloatArray, Measurement, PoseEstimate, PoseIncrement, RangeFrame
-from estimators.models.range import reduce_height
-from estimators.nlos.power import Power
-from estimators.nlos.prediction import PRIOR, Prediction, excess_log_ratio
-from estimators.nlos.robust import sigma_factor
+from estimators.base import Report, Setup, Verdict
+from estimators.messages import FloatArray, IntArray, Measurement, PoseEstimate, PoseIncrement, RangeFrame
 from estimators.nlos.visibility import OBSTRUCTED, Visibility
 
-_NO_BIAS = np.zeros(3)
-
 NlosMethod = Literal["prediction", "power", "visibility", "robust"]
-Reduced: TypeAlias = tuple[FloatArray, float, float, FloatArray]
-"""Anchor (3,), horizontal range to it and the standard deviation of that [m], derivative (3,) by the pose of
-what was taken off for the bearing."""
 
 
-@dataclass(slots=True, eq=False)  # not frozen: that costs four times as much to make, four times a frame
-class Candidate:
-    """A range that is to be held against its prediction.
+@dataclass(slots=True, eq=False)  # not frozen: that costs four times as much to make
+class Candidates:
+    """Ranges of a frame in the plane, to be held against their predictions.
 
     Attributes:
-        anchor_id: whose range it is.
-        stamp_ns: when it was measured.
-        anchor: (3,) position [m], map frame.
-        measured: horizontal range [m].
-        sigma: its standard deviation [m].
-        prior: log-odds of its anchor being blocked, by what was known before this frame.
-        bias_by_pose: (3,) derivative of what was taken off for the bearing by (x, y, yaw).
-        by_power: log-likelihood ratio of its powers.
+        frame: with N ranges.
         pose: (3,) x [m], y [m], yaw [rad] that the body is predicted at.
+        verdicts: (N,) what is wrong with each, `Verdict.WAITING` when nothing is.
+        anchors: (N,) number of each anchor, in the order of the site's; negative where something is wrong.
+        rows: (N, 4) anchor x and y [m], map frame, horizontal range and its standard deviation [m], as
+            `estimators.kernels` has them; of infinite sigma where something is wrong.
+        bias_by_pose: (N, 3) derivative by the pose of what was taken off for the bearing.
     """
 
-    anchor_id: int
-    stamp_ns: int
-    anchor: FloatArray
-    measured: float
-    sigma: float
-    bias_by_pose: FloatArray
-    prior: float
-    by_power: float
+    frame: RangeFrame
     pose: FloatArray
+    verdicts: list[Verdict]
+    anchors: IntArray
+    rows: FloatArray
+    bias_by_pose: FloatArray
 
 
 class HorizontalRanges:
@@ -62,50 +47,49 @@ class HorizontalRanges:
     """
 
     def __init__(self, sigma: float, setup: Setup) -> None:
-        self._sigma = sigma
-        self._anchors = {i: (anchor, setup.height_to(anchor)) for i, anchor in setup.anchors.items()}
-        self._lifts = {i: float(arm[2] - setup.tag_in_body[2]) for i, arm in setup.tags.items()}
-        self._arm, self._bearing_biases = setup.arm, setup.bearing_biases
-        self._newest: tuple[RangeFrame, list[Verdict | Reduced]] | None = None
+        # Numba loads slowly: only who judges ranges waits for it.
+        from estimators.kernels import range_gate
 
-    def of(
-        self, frame: RangeFrame, pose: FloatArray | None = None, yaw_variance: float = 0.0
-    ) -> list[Verdict | Reduced]:
-        """For each range of a frame what it is in the plane, or what is wrong with it.
+        self._kernels = range_gate
+        self._sigma = sigma
+        self._setup = setup
+        self._ids = np.array(list(setup.anchors), dtype=np.int64)
+        self._site = np.array([[*p[:2], setup.height_to(p)] for p in setup.anchors.values()]).reshape(-1, 3)
+
+    def of(self, frame: RangeFrame, pose: FloatArray, yaw_variance: float) -> Candidates:
+        """What a frame's ranges are in the plane, or what is wrong with them.
 
         Args:
             frame: with N ranges.
-            pose: (3,) predicted x [m], y [m], yaw [rad] of the body in the map; None: that bias stays.
-            yaw_variance: of its yaw [rad^2].
+            pose: (3,) predicted x [m], y [m], yaw [rad] of the body in the map.
+            yaw_variance: of its yaw [rad^2]; without a heading, infinite, bias by the bearing stays.
         """
-        bias = None if pose is None else self._bearing_biases.get(frame.tag_id)
-        if bias is not None and pose is not None:
-            arm = self._arm(frame.tag_id)
-            return self._reduced(frame, lambda anchor: bias.at(pose, anchor, arm, yaw_variance))
-        # A filter asks, and a graph behind it asks again.
-        if self._newest is None or self._newest[0] is not frame:
-            self._newest = frame, self._reduced(frame, lambda _: (0.0, _NO_BIAS))
-        return self._newest[1]
-
-    def _reduced(
-        self, frame: RangeFrame, bias_to: Callable[[FloatArray], tuple[float, FloatArray]]
-    ) -> list[Verdict | Reduced]:
-        lift = self._lifts.get(frame.tag_id, 0.0)
-        found: list[Verdict | Reduced] = []
-        for anchor_id, slant in zip(frame.anchor_ids.tolist(), frame.ranges.tolist(), strict=True):
-            if anchor_id not in self._anchors:
-                found.append(Verdict.UNKNOWN_ANCHOR)
-                continue
-            anchor, height = self._anchors[anchor_id]
-            longer, by_pose = bias_to(anchor)
-            reduced = reduce_height(slant - longer, self._sigma, height - lift)
-            if reduced is None:
-                found.append(Verdict.IMPOSSIBLE)
-                continue
+        kernels, setup = self._kernels, self._setup
+        slants, slopes = frame.ranges, np.zeros((len(frame.ranges), 3))
+        bias, arm = setup.bearing_biases.get(frame.tag_id), setup.arm(frame.tag_id)
+        if bias is not None:
+            slants = slants.copy()
+            for i, anchor_id in enumerate(frame.anchor_ids.tolist()):
+                if anchor_id in setup.anchors:
+                    longer, slopes[i] = bias.at(pose, setup.anchors[anchor_id], arm, yaw_variance)
+                    slants[i] -= longer
+        anchors, rows = np.empty(len(slants), dtype=np.int64), np.zeros((len(slants), 4))
+        kernels.reduce_heights(
+            np.ascontiguousarray(frame.anchor_ids),
+            np.ascontiguousarray(slants),
+            self._ids,
+            self._site,
+            float(arm[2] - setup.tag_in_body[2]),
+            self._sigma,
+            anchors,
+            rows,
+        )
+        if bias is not None:
+            usable = anchors >= 0
             # What is taken off the slant range changes the horizontal one as the noise does.
-            by_pose = by_pose if by_pose is _NO_BIAS else by_pose * (reduced[1] / self._sigma)
-            found.append((anchor, *reduced, by_pose))
-        return found
+            slopes[usable] *= rows[usable, 3:] / self._sigma
+        verdicts = [Verdict.WAITING if k >= 0 else kernels.VERDICTS[k] for k in anchors.tolist()]
+        return Candidates(frame, pose.copy(), verdicts, anchors, rows, slopes)
 
 
 class RangeGate:
@@ -152,23 +136,35 @@ class RangeGate:
         )
 
     def __init__(self, config: Config, setup: Setup) -> None:
+        # Numba loads slowly: only who judges ranges waits for it.
+        from estimators.kernels import blocked, range_gate
+
+        self._kernels, self._never = range_gate, blocked.NEVER
         self.horizontal = HorizontalRanges(config.range_sigma, setup)
-        """Height reduction, for those who take up where a filter leaves off."""
-        self._excess = config.nlos_excess
+        """Height reduction: what is to be judged, and for those who take up where a filter leaves off."""
         self._limit = chi2.ppf(config.range_gate, 1)
         methods = config.nlos
-        self._looks_at_residual = "prediction" in methods or "robust" in methods
-        self._weighs = "robust" in methods
-        self._prediction = Prediction(config.nlos_memory) if "prediction" in methods else None
-        self._power = Power(config.nlos_power) if "power" in methods else None
         self._visibility = Visibility(config.obstacle_height, setup) if "visibility" in methods else None
-        self._trust = AnchorTrust(len(setup.anchors))
+        self._settings = (
+            self._limit,
+            config.nlos_excess,
+            config.nlos_memory,
+            config.nlos_power,
+            OBSTRUCTED if "visibility" in methods else 0.0,
+            "prediction" in methods,
+            "power" in methods,
+            "robust" in methods,
+        )
+        self._places = list(setup.anchors.values())
+        self._trust = AnchorTrust(len(self._places))
+        self._known_ns = np.zeros(len(self._places), dtype=np.int64)
+        self._state = (self._known_ns, np.zeros(len(self._places)), *self._trust.state)
+        self.reset()
 
     def reset(self) -> None:
         """Know nothing of any anchor and of what stands around."""
         self._trust.reset()
-        if self._prediction is not None:
-            self._prediction.reset()
+        self._known_ns[:] = self._never
         if self._visibility is not None:
             self._visibility.reset()
 
@@ -184,101 +180,66 @@ class RangeGate:
         if self._visibility is not None:
             self._visibility.see(measurement, pose_at)
 
-    def candidates(
-        self, frame: RangeFrame, pose: FloatArray, yaw_variance: float
-    ) -> list[Verdict | Candidate]:
-        """For each range of a frame what is known before its residual, or what is wrong with it.
-
-        Args:
-            frame: with N ranges.
-            pose: (3,) predicted x [m], y [m], yaw [rad] of the body in the map.
-            yaw_variance: of its yaw [rad^2].
-        """
-        reduced, pose = self.horizontal.of(frame, pose, yaw_variance), pose.copy()
-        signals = zip(
-            frame.anchor_ids.tolist(), frame.rx_power.tolist(), frame.fp_power.tolist(), strict=True
-        )
-        return [
-            item if isinstance(item, Verdict) else self._candidate(frame.stamp_ns, pose, signal, item)
-            for item, signal in zip(reduced, signals, strict=True)
-        ]
-
-    def judge(self, candidate: Candidate, residual: float, nis: float) -> tuple[Verdict, float]:
+    def judge(self, candidates: Candidates, k: int, residual: float, nis: float) -> tuple[Verdict, float]:
         """Verdict on a range, and by how much its sigma is to be multiplied when it is used.
 
         Args:
-            candidate: the range.
+            candidates: ranges of a frame.
+            k: which of them; nothing is wrong with it so far.
             residual: measured minus predicted [m], before the range is used.
             nis: normalised innovation squared, likewise.
         """
-        verdict, factor = self._judge(candidate, residual, nis)
-        if verdict.is_nlos:
-            return verdict, factor
-        variance = residual**2 / nis if nis > 0.0 else candidate.sigma**2
-        self._trust.note(candidate.anchor_id, candidate.stamp_ns, residual, variance, candidate.sigma)
-        if not self._trust.believes(candidate.anchor_id):
-            return Verdict.CONTRADICTS, 1.0
-        return verdict, factor
+        frame, looked = candidates.frame, np.nan
+        while True:
+            code, factor = self._kernels.judged(
+                self._state,
+                self._settings,
+                candidates.anchors[k],
+                frame.stamp_ns,
+                frame.rx_power[k],
+                frame.fp_power[k],
+                candidates.rows[k, 3],
+                residual,
+                nis,
+                looked,
+            )
+            if code != self._kernels.LOOK:
+                return self._kernels.VERDICTS[code], factor
+            looked = self._look(candidates, k)
 
-    def _judge(self, candidate: Candidate, residual: float, nis: float) -> tuple[Verdict, float]:
-        """Verdict on the range alone."""
-        if nis > self._limit and residual < 0.0:
-            # Nothing shortens a range: rather is the pose wrong, which says nothing of what stands between.
-            return Verdict.GATED, 1.0
-        log_odds = candidate.prior + candidate.by_power
-        by_residual = 0.0
-        if self._looks_at_residual:
-            sigma = abs(residual) / sqrt(nis) if nis > 0.0 else candidate.sigma
-            by_residual = excess_log_ratio(residual, sigma, self._excess)
-            log_odds += by_residual
-        if self._prediction is not None:
-            known = candidate.prior + by_residual
-            self._prediction.remember(candidate.anchor_id, candidate.stamp_ns, known)
-        if nis > self._limit and not self._weighs:
-            return Verdict.GATED if self._prediction is None else Verdict.TOO_LONG, 1.0
-        by_visibility = self._looked(candidate, log_odds)
-        log_odds += by_visibility
-        if self._weighs:
-            verdict = Verdict.DOWNWEIGHTED if log_odds > 0.0 else Verdict.ACCEPTED
-            return verdict, sigma_factor(log_odds)
-        if log_odds > 0.0:
-            return _reason(by_residual, candidate.by_power, by_visibility), 1.0
-        return Verdict.ACCEPTED, 1.0
-
-    def _candidate(
-        self,
-        stamp_ns: int,
-        pose: FloatArray,
-        signal: tuple[int, float, float],
-        reduced: Reduced,
-    ) -> Candidate:
-        anchor_id, rx_power, fp_power = signal
-        anchor, measured, sigma, bias_by_pose = reduced
-        prior = self._prediction.prior(anchor_id, stamp_ns) if self._prediction else PRIOR
-        by_power = self._power.log_ratio(rx_power, fp_power) if self._power else 0.0
-        return Candidate(anchor_id, stamp_ns, anchor, measured, sigma, bias_by_pose, prior, by_power, pose)
-
-    def _looked(self, candidate: Candidate, log_odds: float) -> float:
-        """What the LiDAR sees says of a range, if it can change what is thought of it.
+    def judge_together(self, candidates: Candidates, mean: FloatArray, cov: FloatArray) -> Report:
+        """Verdicts on ranges of a frame that are expected together.
 
         Args:
-            candidate: the range.
-            log_odds: of its being blocked, by all else.
+            candidates: N ranges; their sigmas become those they are to be used with, infinite without.
+            mean: (N,) measured minus predicted [m]; is corrected by what is used.
+            cov: (N, N) of the predictions [m^2], likewise.
         """
-        matters = self._weighs or log_odds + OBSTRUCTED > 0.0
-        return (
-            self._visibility.log_ratio(candidate.pose, candidate.anchor)
-            if self._visibility and matters
-            else 0.0
-        )
+        frame, count = candidates.frame, len(mean)
+        codes, report = np.empty(count, dtype=np.int64), np.full((3, count), np.nan)
+        begin = 0
+        while True:
+            begin = self._kernels.judge_together(
+                self._state,
+                self._settings,
+                frame.stamp_ns,
+                candidates.anchors,
+                np.ascontiguousarray(frame.rx_power),
+                np.ascontiguousarray(frame.fp_power),
+                candidates.rows,
+                mean,
+                cov,
+                codes,
+                report,
+                begin,
+            )
+            if begin == count:
+                break
+            report[2, begin] = self._look(candidates, begin)
+        verdicts = tuple([self._kernels.VERDICTS[code] for code in codes.tolist()])
+        return Report(verdicts, report[0], report[1])
 
-
-def _reason(by_residual: float, by_power: float, by_visibility: float) -> Verdict:
-    """What spoke most for a blocked range; its anchor's past when nothing of now did."""
-    reasons = {
-        Verdict.TOO_LONG: by_residual,
-        Verdict.WEAK_FIRST_PATH: by_power,
-        Verdict.OBSTRUCTED: by_visibility,
-    }
-    strongest = max(reasons, key=reasons.__getitem__)
-    return strongest if reasons[strongest] > 0.0 else Verdict.SUSPECT
+    def _look(self, candidates: Candidates, k: int) -> float:
+        """What the LiDAR sees on the way to an anchor."""
+        assert self._visibility is not None
+        return self._visibility.log_ratio(candidates.pose, self._places[candidates.anchors[k]])

@@ -62,22 +62,21 @@ def judge_ranges(
     Returns:
         The report; rows of `factors.ranges`, -1 for the pose.
     """
-    count = len(frame.ranges)
-    verdicts = [Verdict.ACCEPTED] * count
-    residuals, nis = np.full(count, np.nan), np.full(count, np.nan)
+    residuals, nis = np.full((2, len(frame.ranges)), np.nan)
     believed = []
-    for i, candidate in enumerate(gate.candidates(frame, belief.mean[:3], belief.cov[2, 2])):
-        if isinstance(candidate, Verdict):
-            verdicts[i] = candidate
+    candidates = gate.horizontal.of(frame, belief.mean[:3], belief.cov[2, 2])
+    verdicts, anchor_ids = candidates.verdicts, frame.anchor_ids.tolist()
+    for i, (x, y, measured, sigma) in enumerate(candidates.rows.tolist()):
+        if verdicts[i] is not Verdict.WAITING:
             continue
-        predicted, by_pose = horizontal_range(belief.mean, candidate.anchor, arm)
-        H, R = (by_pose + candidate.bias_by_pose)[None], np.array([[candidate.sigma**2]])
-        residuals[i] = candidate.measured - predicted
+        predicted, by_pose = horizontal_range(belief.mean, (x, y), arm)
+        H, R = (by_pose + candidates.bias_by_pose[i])[None], np.array([[sigma**2]])
+        residuals[i] = measured - predicted
         nis[i] = residuals[i] ** 2 / belief.spread(H, R).item()
-        verdicts[i], factor = gate.judge(candidate, residuals[i], nis[i])
+        verdicts[i], factor = gate.judge(candidates, i, residuals[i], nis[i])
         if verdicts[i].is_used:
             belief.correct(residuals[i : i + 1], H, factor**2 * R)
-            believed.append((numbers[candidate.anchor_id], candidate.measured, factor * candidate.sigma))
+            believed.append((numbers[anchor_ids[i]], measured, factor * sigma))
     return Report(tuple(verdicts), residuals, nis), _range_rows(believed, arm)
 
 
@@ -103,12 +102,13 @@ def believed_ranges(
         arm: (3,) tag antenna in the body frame [m].
         numbers: anchor id -> variable in the graph.
     """
+    candidates = horizontal.of(frame, pose, yaw_variance)
     believed = [
-        (numbers[anchor_id], *item[1:3])
-        for anchor_id, verdict, item in zip(
-            frame.anchor_ids.tolist(), verdicts, horizontal.of(frame, pose, yaw_variance), strict=True
+        (numbers[anchor_id], *row[2:])
+        for anchor_id, verdict, item, row in zip(
+            frame.anchor_ids.tolist(), verdicts, candidates.verdicts, candidates.rows.tolist(), strict=True
         )
-        if verdict is Verdict.ACCEPTED and not isinstance(item, Verdict)
+        if verdict is Verdict.ACCEPTED and item is Verdict.WAITING
     ]
     return _range_rows(believed, arm)
 

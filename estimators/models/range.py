@@ -56,7 +56,9 @@ def reduce_height(slant: float, sigma: float, height_difference: float) -> tuple
     return horizontal, sigma * slant / horizontal
 
 
-def horizontal_range(pose: FloatArray, anchor: FloatArray, lever_arm: FloatArray) -> tuple[float, FloatArray]:
+def horizontal_range(
+    pose: FloatArray, anchor: FloatArray | tuple[float, float], lever_arm: FloatArray
+) -> tuple[float, FloatArray]:
     """Predicted horizontal range and its Jacobian.
 
     Args:

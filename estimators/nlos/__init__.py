@@ -8,5 +8,5 @@ blocked a moment ago. So a weak first path, or a box of unknown height, does not
 with the pose when its anchor was clear a moment ago, but it takes less to reject it then.
 
 Source: Bayes' rule for independent observations and a two-state Markov chain, Thrun, Burgard and Fox,
-Probabilistic Robotics, 4.2; power: vendor's rule; the rest as each class says.
+Probabilistic Robotics, 4.2; the rest as `estimators.kernels.blocked` says.
 """

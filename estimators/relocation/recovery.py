@@ -10,7 +10,15 @@ from estimators.geometry import compose, inverse
 from estimators.messages import FloatArray, Measurement, PoseEstimate, PoseIncrement, RangeFrame, Scan
 from estimators.range_gate import HorizontalRanges
 from estimators.relocation.map_search import LEAST_RANGES, MOST_CELLS, MapSearch
-from estimators.relocation.search import Minimum, agreeing, find_pose, lies_outside, too_short, total_loss
+from estimators.relocation.search import (
+    Minimum,
+    agreeing,
+    find_pose,
+    lies_outside,
+    residuals_at,
+    too_short,
+    total_loss,
+)
 from estimators.relocation.window import PlacedRanges, Window
 
 SHORTER = (1.0, 0.5)
@@ -156,7 +164,8 @@ class Recovering:
             if recent is None:
                 return False
             held = self._at_keyframe(np.array([*estimate.xy, estimate.yaw]))
-            if _fits(recent, held) or not self._is_worth_a_search(recent, held, estimate.stamp_ns):
+            residuals = residuals_at(recent, held[None])
+            if _fits(residuals) or not self._is_worth_a_search(residuals, estimate.stamp_ns):
                 return False
         place = in_map.search(now_ns)
         if place is None:
@@ -169,8 +178,9 @@ class Recovering:
             in_map.flaw = "position is not sure enough yet"
             return False
         if recent is not None:
-            share = agreeing(recent, pose)
-            if share < self._config.min_agreeing or too_short(recent, pose) > MOST_TOO_SHORT:
+            residuals = residuals_at(recent, pose[None])
+            share = agreeing(residuals)
+            if share < self._config.min_agreeing or too_short(residuals) > MOST_TOO_SHORT:
                 in_map.flaw = f"ranges contradict, {share:.0%} agree"
                 return False
             if estimate is not None and not _is_better(pose, cov, recent, held, estimate.planar_cov):
@@ -178,9 +188,9 @@ class Recovering:
         self._set(pose, cov)
         return True
 
-    def _is_worth_a_search(self, placed: PlacedRanges, held: FloatArray, now_ns: int) -> bool:
-        """Whether a filter's pose (3,) may be wrong: blocked ranges alone are no reason for a long search."""
-        return self._is_young(now_ns) or too_short(placed, held) > MOST_TOO_SHORT
+    def _is_worth_a_search(self, residuals: FloatArray, now_ns: int) -> bool:
+        """Whether a filter's pose may be wrong: blocked ranges alone are no reason for a long search."""
+        return self._is_young(now_ns) or too_short(residuals) > MOST_TOO_SHORT
 
     def _is_certain(self, cov: FloatArray) -> bool:
         """Whether a found pose with a covariance (3, 3) may be taken."""
@@ -201,9 +211,10 @@ class Recovering:
             tried = len(placed.ranges)
             if estimate is not None:
                 held = self._at_keyframe(np.array([*estimate.xy, estimate.yaw]))
-                if _fits(placed, held):
+                residuals = residuals_at(placed, held[None])
+                if _fits(residuals):
                     break
-                if not self._is_worth_a_search(placed, held, estimate.stamp_ns):
+                if not self._is_worth_a_search(residuals, estimate.stamp_ns):
                     continue
             found, flaw = self._search(placed)
             note = note or flaw
@@ -260,9 +271,9 @@ def _is_clearly_less(loss: float, other: float) -> bool:
     return other > CLEARLY_LESS * loss + CLEARLY_BELOW
 
 
-def _fits(placed: PlacedRanges, pose: FloatArray) -> bool:
-    """Whether a pose (3,) of the way's frame explains the ranges well."""
-    return float(total_loss(placed, pose[None])[0]) < DOUBTFUL_LOSS * len(placed.ranges)
+def _fits(residuals: FloatArray) -> bool:
+    """Whether a pose explains ranges well that leave residuals (1, N)."""
+    return float(total_loss(residuals)[0]) < DOUBTFUL_LOSS * residuals.size
 
 
 def _is_better(
@@ -273,7 +284,7 @@ def _is_better(
     Two anchors of four that are blocked alike fit a wrong place with a third one better than the right place
     without. But at the right place no range is too short.
     """
-    loss, other = total_loss(placed, np.array([found, held])).tolist()
+    loss, other = total_loss(residuals_at(placed, np.array([found, held]))).tolist()
     return _is_clearly_less(loss, other) and lies_outside(found, held, found_cov + held_cov, OUTSIDE)
 
 

@@ -66,9 +66,15 @@ class Minimum:
     rival: float
 
 
-def total_loss(placed: PlacedRanges, poses: FloatArray) -> FloatArray:
-    """Loss (S,) of all ranges if the way's frame stood at each of the poses (S, 3)."""
-    residuals, _ = _residuals(placed, poses)
+def residuals_at(placed: PlacedRanges, poses: FloatArray) -> FloatArray:
+    """Measured minus predicted ranges (S, N) in sigmas if the way's frame stood at the poses (S, 3)."""
+    *_, distance = _offsets(placed, poses)
+    residuals: FloatArray = (placed.ranges - distance) / placed.sigmas
+    return residuals
+
+
+def total_loss(residuals: FloatArray) -> FloatArray:
+    """Loss (S,) of all ranges with residuals (S, N) in sigmas."""
     too_long = BLOCKED_LOSS * -np.expm1(-(residuals**2) / (2.0 * BLOCKED_LOSS))
     size = np.abs(residuals)
     too_short = np.where(size < SHORT_LIMIT, 0.5 * size**2, SHORT_LIMIT * (size - 0.5 * SHORT_LIMIT))
@@ -76,15 +82,13 @@ def total_loss(placed: PlacedRanges, poses: FloatArray) -> FloatArray:
     return losses
 
 
-def too_short(placed: PlacedRanges, pose: FloatArray) -> float:
-    """Share of ranges too short by more than `SHORT_LIMIT` if the way's frame stood at a pose (3,)."""
-    residuals, _ = _residuals(placed, pose[None])
+def too_short(residuals: FloatArray) -> float:
+    """Share of residuals in sigmas that are too short by more than `SHORT_LIMIT`."""
     return float((residuals < -SHORT_LIMIT).mean())
 
 
-def agreeing(placed: PlacedRanges, pose: FloatArray) -> float:
-    """Share of ranges within `SHORT_LIMIT` sigma if the way's frame stood at a pose (3,)."""
-    residuals, _ = _residuals(placed, pose[None])
+def agreeing(residuals: FloatArray) -> float:
+    """Share of residuals in sigmas within `SHORT_LIMIT`."""
     return float((np.abs(residuals) < SHORT_LIMIT).mean())
 
 
@@ -106,26 +110,26 @@ def find_pose(placed: PlacedRanges, bias_sigma: float) -> Minimum | None:
         return None
     coarse = placed.some(np.argsort(placed.anchor_ids, kind="stable")[::COARSE_SHARE])
     poses = _descend(coarse, poses, COARSE_STEPS)
-    poses = _best_apart(poses, total_loss(coarse, poses))
+    poses = _best_apart(poses, total_loss(residuals_at(coarse, poses)))
     poses = _descend(placed, poses, FINE_STEPS)
-    losses = total_loss(placed, poses)
+    losses = total_loss(residuals_at(placed, poses))
     best = int(np.argmin(losses))
     others = losses[_is_elsewhere(poses, poses[best])]
     pose = poses[best]
     pose[2] = float(wrap_angles(pose[2:])[0])
-    residuals, jacobian = _residuals(placed, pose[None])
+    residuals, jacobian = _linearised(placed, pose[None])
     cov = _covariance(placed, pose, residuals, jacobian, bias_sigma)
     if cov is None:
         return None
-    agreeing = np.abs(residuals[0]) < SHORT_LIMIT
-    mean_square = float((residuals[0, agreeing] ** 2).mean()) if agreeing.any() else np.inf
+    agree = np.abs(residuals[0]) < SHORT_LIMIT
+    mean_square = float((residuals[0, agree] ** 2).mean()) if agree.any() else np.inf
     return Minimum(
         pose=pose,
         # Ranges that agree less well than their noise allows hold the pose less well, too.
         cov=cov * max(1.0, mean_square),
         loss=float(losses[best]),
-        agreeing=float(agreeing.mean()),
-        least_agreeing=min(float(third.mean()) for third in np.array_split(agreeing, 3)),
+        agreeing=agreeing(residuals),
+        least_agreeing=min(float(third.mean()) for third in np.array_split(agree, 3)),
         mean_square=mean_square,
         rival=float(others.min()) if len(others) else np.inf,
     )
@@ -151,7 +155,7 @@ def _is_elsewhere(poses: FloatArray, pose: FloatArray) -> NDArray[np.bool_]:
 def _descend(placed: PlacedRanges, poses: FloatArray, steps: tuple[float, ...]) -> FloatArray:
     """Gauss-Newton steps on every pose (S, 3)."""
     for softening in steps:
-        residuals, jacobian = _residuals(placed, poses)
+        residuals, jacobian = _linearised(placed, poses)
         information, gradient = _normal_equations(residuals, jacobian, softening)
         information += 1e-6 * np.trace(information, axis1=1, axis2=2)[:, None, None] * np.eye(3)
         step = np.linalg.solve(information, gradient[:, :, None])[:, :, 0]
@@ -159,14 +163,19 @@ def _descend(placed: PlacedRanges, poses: FloatArray, steps: tuple[float, ...]) 
     return poses
 
 
-def _residuals(placed: PlacedRanges, poses: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Measured minus predicted range in sigmas, (S, N), and what it loses by x, y and yaw, (S, N, 3)."""
+def _offsets(placed: PlacedRanges, poses: FloatArray) -> tuple[FloatArray, ...]:
+    """How tags lie from the body's origin, x and y, how they lie from anchors, and how far, each (S, N)."""
     c, s = np.cos(poses[:, 2:]), np.sin(poses[:, 2:])
     arm_x = c * placed.tags[:, 0] - s * placed.tags[:, 1]
     arm_y = s * placed.tags[:, 0] + c * placed.tags[:, 1]
     dx = poses[:, 0:1] + arm_x - placed.anchors[:, 0]
     dy = poses[:, 1:2] + arm_y - placed.anchors[:, 1]
-    distance = np.maximum(np.hypot(dx, dy), 1e-9)
+    return arm_x, arm_y, dx, dy, np.maximum(np.hypot(dx, dy), 1e-9)
+
+
+def _linearised(placed: PlacedRanges, poses: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """As `residuals_at`, and what they lose by x, y and yaw, (S, N, 3)."""
+    arm_x, arm_y, dx, dy, distance = _offsets(placed, poses)
     scale = distance * placed.sigmas
     ux, uy = dx / scale, dy / scale
     residuals = (placed.ranges - distance) / placed.sigmas

@@ -2,11 +2,12 @@
 
 from collections import deque
 from dataclasses import dataclass, replace
+from math import cos, sin
 
 import numpy as np
 
 from estimators.base import Setup, Verdict
-from estimators.geometry import compose, inverse, transform, transform_each, wrap_angle
+from estimators.geometry import compose, inverse, transform, wrap_angle
 from estimators.lidar.keyframes import is_covariance
 from estimators.messages import FloatArray, IntArray, PoseIncrement, RangeFrame
 from estimators.range_gate import HorizontalRanges
@@ -15,6 +16,7 @@ LONGEST_STEP_NS = 500_000_000
 """Ranges between two poses further apart than this have no place on the way."""
 MOST_RANGES = 250
 """More ranges than this say little more, and cost time."""
+_NO_POSE = np.zeros(3)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,12 +58,17 @@ class PlacedRanges:
         )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Placed:
+@dataclass(slots=True, eq=False)
+class _Frame:
+    """Ranges of one frame; `tag`, `step` and `until` are known once it is placed."""
+
     stamp_ns: int
-    step: int
-    tag: FloatArray
-    rows: FloatArray  # (N, 5): anchor x, anchor y, anchor id, range, sigma
+    arm: FloatArray
+    rows: FloatArray  # (N, 4) as `Candidates` has them
+    anchor_ids: IntArray
+    tag: tuple[float, float] = (0.0, 0.0)
+    step: int = 0
+    until: int = 0  # ranges on the way up to the last of these
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,7 +96,7 @@ class Window:
     def clear(self) -> None:
         """Forget everything."""
         self._newest_ns: int | None = None
-        self._waiting: deque[tuple[int, FloatArray, FloatArray]] = deque()
+        self._waiting: deque[_Frame] = deque()
         self._break_off()
 
     def _break_off(self) -> None:
@@ -99,7 +106,7 @@ class Window:
         """Increments from the newest keyframe on."""
         self._keyframe = self._last = np.zeros(3)
         self._last_ns: int | None = None
-        self._placed: deque[_Placed] = deque()
+        self._placed: deque[_Frame] = deque()
         self._steps: deque[_Step] = deque()
         self._steps_made = 0
 
@@ -112,18 +119,14 @@ class Window:
         """Take a frame; what can be used gets `Verdict.WAITING`."""
         if self._is_late(frame.stamp_ns):
             return [Verdict.LATE] * len(frame.ranges)
-        verdicts: list[Verdict] = []
-        rows: list[tuple[float, ...]] = []
-        for anchor_id, item in zip(frame.anchor_ids.tolist(), self._horizontal.of(frame), strict=True):
-            if isinstance(item, Verdict):
-                verdicts.append(item)
-            else:
-                anchor, measured, sigma, _ = item
-                verdicts.append(Verdict.WAITING)
-                rows.append((anchor[0], anchor[1], anchor_id, measured, sigma))
-        if rows:
-            self._waiting.append((frame.stamp_ns, self._setup.arm(frame.tag_id)[:2], np.array(rows)))
-            while self._waiting[0][0] < frame.stamp_ns - self._length_ns:
+        candidates = self._horizontal.of(frame, _NO_POSE, np.inf)
+        verdicts, rows, ids = candidates.verdicts, candidates.rows, frame.anchor_ids
+        if Verdict.WAITING in verdicts:
+            if verdicts.count(Verdict.WAITING) < len(verdicts):
+                usable = candidates.anchors >= 0
+                rows, ids = rows[usable], ids[usable]
+            self._waiting.append(_Frame(frame.stamp_ns, self._setup.arm(frame.tag_id), rows, ids))
+            while self._waiting[0].stamp_ns < frame.stamp_ns - self._length_ns:
                 self._waiting.popleft()
         return verdicts
 
@@ -156,23 +159,23 @@ class Window:
         if self._last_ns is None:
             return None
         since_ns = self._last_ns - round(age * 1e9)
-        placed = [item for item in self._placed if item.stamp_ns >= since_ns]
-        count = sum(len(item.rows) for item in placed)
-        if not count:
+        placed = [frame for frame in self._placed if frame.stamp_ns >= since_ns]
+        if not placed:
             return None
+        count = placed[-1].until - placed[0].until + len(placed[0].rows)
         placed = placed[:: -(-count // MOST_RANGES)]
         T_keyframe_way = inverse(self._keyframe)
-        rows = np.concatenate([item.rows for item in placed])
-        each = [len(item.rows) for item in placed]
-        tags = transform(T_keyframe_way, np.array([item.tag for item in placed])).repeat(each, axis=0)
-        steps = self._steps_made - np.array([item.step for item in placed], dtype=np.int64).repeat(each)
-        begun = list(self._steps)[::-1][: int(steps.max())]
+        rows = np.concatenate([frame.rows for frame in placed])
+        ids = np.concatenate([frame.anchor_ids for frame in placed])
+        each = [len(frame.rows) for frame in placed]
+        tags = transform(T_keyframe_way, np.array([frame.tag for frame in placed])).repeat(each, axis=0)
+        steps = self._steps_made - np.array([frame.step for frame in placed], dtype=np.int64).repeat(each)
+        begun = list(self._steps)[::-1][: int(steps[0])]
         begins = np.array([compose(T_keyframe_way, step.begin) for step in begun]).reshape(-1, 3)
         ends = transform(T_keyframe_way, np.array([step.end[:2] for step in begun]).reshape(-1, 2))
         covs = np.array([step.cov for step in begun]).reshape(-1, 3, 3)
-        sigmas = np.sqrt(rows[:, 4] ** 2 + _drift(tags, steps, ends, covs))
-        ids = rows[:, 2].astype(np.int64)
-        return PlacedRanges(tags, rows[:, :2], ids, rows[:, 3], sigmas, steps, begins, ends, covs)
+        sigmas = np.sqrt(rows[:, 3] ** 2 + _drift(tags, steps, ends, covs))
+        return PlacedRanges(tags, rows[:, :2], ids, rows[:, 2], sigmas, steps, begins, ends, covs)
 
     def _is_late(self, stamp_ns: int) -> bool:
         if self._newest_ns is not None and stamp_ns < self._newest_ns:
@@ -184,17 +187,24 @@ class Window:
         """Put ranges that wait for this pose on the way from the pose before."""
         assert self._last_ns is not None
         span = stamp_ns - self._last_ns
-        ranges = [item for item in self._waiting if self._last_ns <= item[0] <= stamp_ns]
+        frames = [frame for frame in self._waiting if self._last_ns <= frame.stamp_ns <= stamp_ns]
         self._waiting.clear()
-        if not ranges or not 0 < span <= LONGEST_STEP_NS:
+        if not 0 < span <= LONGEST_STEP_NS:
             return
-        change = pose - self._last
-        change[2] = wrap_angle(change[2])
-        shares = np.array([(at_ns - self._last_ns) / span for at_ns, _, _ in ranges])
-        arms = np.array([arm for _, arm, _ in ranges])
-        tags = transform_each(self._last + shares[:, None] * change, arms)
-        for (at_ns, _, rows), tag in zip(ranges, tags, strict=True):
-            self._placed.append(_Placed(at_ns, self._steps_made, tag, rows))
+        # In plain floats: arrays of a few numbers take longer than all of the arithmetic.
+        (x, y, yaw), (to_x, to_y, to_yaw) = self._last.tolist(), pose.tolist()
+        turn = wrap_angle(to_yaw - yaw)
+        for frame in frames:
+            share = (frame.stamp_ns - self._last_ns) / span
+            c, s = cos(yaw + share * turn), sin(yaw + share * turn)
+            arm_x, arm_y, _ = frame.arm.tolist()
+            frame.tag = (
+                x + share * (to_x - x) + c * arm_x - s * arm_y,
+                y + share * (to_y - y) + s * arm_x + c * arm_y,
+            )
+            frame.step = self._steps_made
+            frame.until = len(frame.rows) + (self._placed[-1].until if self._placed else 0)
+            self._placed.append(frame)
 
     def _forget(self, before_ns: int) -> None:
         while self._placed and self._placed[0].stamp_ns < before_ns:
@@ -206,9 +216,13 @@ class Window:
 
 def _drift(tags: FloatArray, steps: IntArray, ends: FloatArray, covs: FloatArray) -> FloatArray:
     """Variance (N,) along one axis of each tag's place, as far as steps since then have added to it [m^2]."""
-    shift = np.concatenate([[0.0], np.cumsum(0.5 * (covs[:, 0, 0] + covs[:, 1, 1]))])
-    total: FloatArray = shift[steps]
-    for k, (end, cov) in enumerate(zip(ends, covs, strict=True)):
-        older = steps > k
-        total[older] += 0.5 * cov[2, 2] * ((tags[older] - end) ** 2).sum(axis=1)
+    # The turn of a step moves a tag by its distance from the step's end; its square is written out.
+    turned, (x, y) = 0.5 * covs[:, 2, 2], ends.T
+    shifted = 0.5 * (covs[:, 0, 0] + covs[:, 1, 1])
+    sums = np.zeros((len(covs) + 1, 4))
+    np.cumsum(
+        np.column_stack([shifted + turned * (x * x + y * y), turned, turned * x, turned * y]), 0, out=sums[1:]
+    )
+    (constant, square, by_x, by_y), (x, y) = sums[steps].T, tags.T
+    total: FloatArray = constant + square * (x * x + y * y) - 2.0 * (by_x * x + by_y * y)
     return total

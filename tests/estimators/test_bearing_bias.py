@@ -12,7 +12,7 @@ from estimators.graph.judging import Belief, judge_ranges
 from estimators.messages import FloatArray, PoseEstimate, RangeFrame
 from estimators.models.range import horizontal_range
 from estimators.models.range_bias import BearingBias
-from estimators.range_gate import HorizontalRanges, RangeGate
+from estimators.range_gate import Candidates, HorizontalRanges, RangeGate
 from tests.estimators.models.finite_differences import numerical_jacobian
 from tests.estimators.test_several_tags import ARMS, frame_of
 from tests.estimators.test_several_tags import ROBOT as CENTRED
@@ -70,10 +70,11 @@ def test_an_unknown_heading_leaves_it_in_a_filter_too() -> None:
     np.testing.assert_array_equal(reports[0].residuals, reports[1].residuals)
 
 
-def reduced(frame: RangeFrame, pose: FloatArray) -> list[tuple[FloatArray, float, float, FloatArray]]:
+def reduced(frame: RangeFrame, pose: FloatArray) -> Candidates:
     """What is left of a frame's ranges at a pose; all of them can be used."""
-    items = HorizontalRanges(SIGMA, CORRECTED).of(frame, pose)
-    return [item for item in items if not isinstance(item, Verdict)]
+    candidates = HorizontalRanges(SIGMA, CORRECTED).of(frame, pose, 0.0)
+    assert candidates.verdicts == [Verdict.WAITING] * 4
+    return candidates
 
 
 def differentiated(frame: RangeFrame) -> FloatArray:
@@ -81,7 +82,8 @@ def differentiated(frame: RangeFrame) -> FloatArray:
 
     def residuals(pose: FloatArray) -> FloatArray:
         arm = ARMS[frame.tag_id]
-        return np.array([horizontal_range(pose, item[0], arm)[0] - item[1] for item in reduced(frame, pose)])
+        rows = reduced(frame, pose).rows
+        return np.array([horizontal_range(pose, row[:2], arm)[0] - row[2] for row in rows])
 
     return numerical_jacobian(residuals, START.pose)
 
@@ -89,9 +91,18 @@ def differentiated(frame: RangeFrame) -> FloatArray:
 @pytest.mark.parametrize("tag_id", ARMS)
 def test_what_is_taken_off_the_horizontal_range_has_the_derivative_that_it_says(tag_id: int) -> None:
     frame = patterned(tag_id, 0, START.pose)
-    items = reduced(frame, START.pose)
-    by_pose = [horizontal_range(START.pose, item[0], ARMS[tag_id])[1] + item[3] for item in items]
-    np.testing.assert_allclose(by_pose, differentiated(frame), atol=1e-7)
+    candidates = reduced(frame, START.pose)
+    by_pose = [horizontal_range(START.pose, row[:2], ARMS[tag_id])[1] for row in candidates.rows]
+    np.testing.assert_allclose(by_pose + candidates.bias_by_pose, differentiated(frame), atol=1e-7)
+
+
+def test_without_a_heading_the_bias_by_the_bearing_stays() -> None:
+    frame, pose = patterned(1, 0, START.pose), START.pose
+    lost = HorizontalRanges(SIGMA, CORRECTED).of(frame, pose, np.inf)
+    blind = HorizontalRanges(SIGMA, ROBOT).of(frame, pose, 0.0)
+    np.testing.assert_array_equal(lost.rows, blind.rows)
+    np.testing.assert_array_equal(lost.bias_by_pose, 0.0)
+    assert (reduced(frame, pose).rows[:, 2] != blind.rows[:, 2]).all()
 
 
 @pytest.mark.parametrize("tag_id", ARMS)
@@ -99,7 +110,7 @@ def test_filters_learn_from_the_derivative_what_the_ranges_say_of_the_heading(ta
     # The heading is so well known that nearly all of the bias is taken off.
     sure = Start(START.pose, np.array([0.02, 0.02, 0.02]), still_for=60.0)
     cov, frame = np.diag(sure.sigma**2), patterned(tag_id, 0, START.pose)
-    H, sigmas = differentiated(frame), np.array([item[2] for item in reduced(frame, START.pose)])
+    H, sigmas = differentiated(frame), reduced(frame, START.pose).rows[:, 3]
     expected = H.T @ np.diag(sigmas**-2) @ H
     config = estimator_config_class("ekf").model_validate({"range_sigma": SIGMA})
     ekf = make_estimator("ekf", config, replace(CORRECTED, start=sure))

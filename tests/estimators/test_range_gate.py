@@ -5,12 +5,15 @@ from itertools import permutations
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from estimators import estimator_config_class, make_estimator
 from estimators.base import Setup, Start, Verdict
 from estimators.messages import FloatArray, PoseIncrement, RangeFrame
+from estimators.models.range import reduce_height
 from estimators.nlos.visibility import OBSTRUCTED, Visibility
-from estimators.range_gate import Candidate, NlosMethod, RangeGate
+from estimators.range_gate import NlosMethod, RangeGate
 from tests.estimators.matched_world import HALL, true_ranges
 from tests.strategies import range_frame
 
@@ -37,9 +40,8 @@ def frame_at(k: int, excess: FloatArray, difference: float | FloatArray = NO_POW
 
 def judged(of: RangeGate, k: int, residual: float, difference: float = NO_POWER) -> Verdict:
     """Verdict on the first range of a frame."""
-    candidate = of.candidates(frame_at(k, np.zeros(4), difference), POSE, 0.0)[0]
-    assert isinstance(candidate, Candidate)
-    verdict, _ = of.judge(candidate, residual, (residual / EXPECTED_SIGMA) ** 2)
+    candidates = of.horizontal.of(frame_at(k, np.zeros(4), difference), POSE, 0.0)
+    verdict, _ = of.judge(candidates, 0, residual, (residual / EXPECTED_SIGMA) ** 2)
     return verdict
 
 
@@ -62,6 +64,13 @@ def test_a_range_that_is_too_long_is_named_so_and_its_anchor_remembered() -> Non
     assert judged(remembering, 1, 0.25) is Verdict.TOO_LONG
     assert judged(remembering, 2, 0.0) is Verdict.SUSPECT
     assert judged(remembering, 200, 0.0) is Verdict.ACCEPTED
+
+
+def test_a_reset_forgets_who_was_blocked() -> None:
+    remembering = gate("prediction")
+    assert judged(remembering, 0, 0.4) is Verdict.TOO_LONG
+    remembering.reset()
+    assert judged(remembering, 1, 0.0) is Verdict.ACCEPTED
 
 
 def test_an_anchor_that_was_long_clear_is_not_doubted_for_one_outlier() -> None:
@@ -140,9 +149,8 @@ def test_robust_uses_every_range_that_is_not_too_short_but_counts_the_long_ones_
     soft = gate("robust")
     factors = []
     for k, residual in enumerate((0.0, 0.2, 0.4, 2.0)):
-        candidate = soft.candidates(frame_at(k, np.zeros(4)), POSE, 0.0)[0]
-        assert isinstance(candidate, Candidate)
-        verdict, factor = soft.judge(candidate, residual, (residual / EXPECTED_SIGMA) ** 2)
+        candidates = soft.horizontal.of(frame_at(k, np.zeros(4)), POSE, 0.0)
+        verdict, factor = soft.judge(candidates, 0, residual, (residual / EXPECTED_SIGMA) ** 2)
         assert verdict is (Verdict.DOWNWEIGHTED if residual >= 0.4 else Verdict.ACCEPTED)
         factors.append(factor)
     assert factors == sorted(factors)
@@ -175,7 +183,74 @@ def test_what_is_no_range_says_what_is_wrong() -> None:
         ranges=np.array([np.nan, -3.0, 0.5, 5.0]),
     )
     wrong = Verdict.IMPOSSIBLE
-    assert gate("prediction").candidates(bad, POSE, 0.0) == [wrong, wrong, wrong, Verdict.UNKNOWN_ANCHOR]
+    candidates = gate("prediction").horizontal.of(bad, POSE, 0.0)
+    assert candidates.verdicts == [wrong, wrong, wrong, Verdict.UNKNOWN_ANCHOR]
+    assert np.isinf(candidates.rows[:, 3]).all()
+    report = gate("prediction").judge_together(candidates, np.zeros(4), np.eye(4))
+    assert list(report.verdicts) == candidates.verdicts
+    assert np.isnan([report.residuals, report.nis]).all()
+
+
+@pytest.mark.parametrize("methods", [(), ("prediction", "power", "visibility"), ("robust", "visibility")])
+def test_what_is_judged_together_is_judged_as_by_a_kalman_filter_one_by_one(
+    methods: tuple[NlosMethod, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    obstruct(monkeypatch)
+    rng = np.random.default_rng(6)
+    together, alone = gate(*methods), gate(*methods)
+    given: set[Verdict] = set()
+    for k in range(200):
+        frame = frame_at(k, np.zeros(4), rng.choice([CLEAR, WEAK], 4))
+        frame = replace(frame, anchor_ids=np.where(rng.random(4) < 0.1, 99, frame.anchor_ids))
+        root = 0.1 * rng.standard_normal((4, 4))
+        mean = root @ rng.standard_normal(4) + SIGMA * rng.standard_normal(4) + 0.5 * (rng.random(4) < 0.2)
+        cov = root @ root.T
+        candidates = together.horizontal.of(frame, POSE, 0.0)
+        report = together.judge_together(candidates, mean.copy(), cov.copy())
+        state, spread = np.zeros(4), cov
+        singles = alone.horizontal.of(frame, POSE, 0.0)
+        for i, verdict in enumerate(singles.verdicts):
+            if verdict is not Verdict.WAITING:
+                assert report.verdicts[i] is verdict
+                continue
+            H, sigma = np.eye(4)[i], singles.rows[i, 3]
+            residual = mean[i] - state[i]
+            nis = residual**2 / (spread[i, i] + sigma**2)
+            expected, factor = alone.judge(singles, i, residual, nis)
+            given.add(expected)
+            assert report.verdicts[i] is expected
+            assert report.residuals[i] == pytest.approx(residual, abs=1e-12)
+            assert report.nis[i] == pytest.approx(nis, rel=1e-9)
+            assert candidates.rows[i, 3] == pytest.approx(factor * sigma if expected.is_used else np.inf)
+            if expected.is_used:
+                gain = spread @ H / (spread[i, i] + (factor * sigma) ** 2)
+                state = state + gain * residual
+                spread = spread - np.outer(gain, H @ spread)
+    assert len(given) >= 3 if methods else given == {Verdict.ACCEPTED, Verdict.GATED}
+
+
+@given(st.floats(-1.0, 20.0) | st.just(np.nan), st.floats(0.0, 6.0), st.floats(-1.0, 1.0))
+def test_ranges_are_reduced_as_the_model_does(slant: float, height: float, lift: float) -> None:
+    arm = HALL.tag_in_body + np.array([0.0, 0.0, lift])
+    anchor = np.array([4.0, 2.0, HALL.height + HALL.tag_in_body[2] + height])
+    setup = replace(HALL, anchors={5: anchor}, tags={2: arm})
+    frame = replace(range_frame(0, [5], [slant]), tag_id=2)
+    candidates = RangeGate(RangeGate.Config(range_sigma=SIGMA), setup).horizontal.of(frame, POSE, 0.0)
+    expected = reduce_height(slant, SIGMA, setup.height_to(anchor) - lift)
+    if expected is None:
+        assert candidates.verdicts == [Verdict.IMPOSSIBLE]
+    else:
+        np.testing.assert_allclose(candidates.rows, [[4.0, 2.0, *expected]], rtol=1e-9)
+
+
+def test_columns_of_a_table_are_ranges_like_any_others() -> None:
+    frame = frame_at(0, np.array([0.0, 0.9, 0.0, 0.0]), CLEAR)
+    table = np.column_stack([frame.ranges, frame.rx_power, frame.fp_power])
+    strided = RangeFrame(0, frame.tag_id, np.repeat(frame.anchor_ids, 2)[::2], *table.T)
+    config = estimator_config_class("pf_ibas").model_validate({})
+    reports = [make_estimator("pf_ibas", config, SURE).update(each) for each in (frame, strided)]
+    assert reports[0].verdicts == reports[1].verdicts
+    np.testing.assert_array_equal(reports[0].residuals, reports[1].residuals)
 
 
 FILTERS = ["ekf", "graph", "pf", "pf_ibas", "pf_ibas_graph"]

@@ -67,10 +67,8 @@ def test_ranges_are_reduced_by_the_height_of_their_own_tag() -> None:
     horizontal = HorizontalRanges(0.1, ROBOT)
     for tag_id, arm in ARMS.items():
         tag = transform(START.pose, arm[None, :2])[0]
-        for item in horizontal.of(frame_of(tag_id, 0, START.pose)):
-            assert not isinstance(item, Verdict)
-            anchor, reduced, *_ = item
-            assert reduced == pytest.approx(float(np.linalg.norm(anchor[:2] - tag)))
+        rows = horizontal.of(frame_of(tag_id, 0, START.pose), START.pose, 0.0).rows
+        np.testing.assert_allclose(rows[:, 2], np.linalg.norm(rows[:, :2] - tag, axis=1))
 
 
 def test_a_search_for_the_pose_places_each_tag_where_it_sits() -> None:

@@ -5,9 +5,31 @@ import subprocess
 import sys
 from pathlib import Path
 
-from estimators.kernels import cloud, likelihood, motion, posterior, scan, scan_fit, scan_lines
+from estimators.kernels import (
+    anchor_trust,
+    blocked,
+    cloud,
+    likelihood,
+    motion,
+    posterior,
+    range_gate,
+    scan,
+    scan_fit,
+    scan_lines,
+)
 
-MODULES = (cloud, likelihood, motion, posterior, scan, scan_fit, scan_lines)
+MODULES = (
+    anchor_trust,
+    blocked,
+    cloud,
+    likelihood,
+    motion,
+    posterior,
+    range_gate,
+    scan,
+    scan_fit,
+    scan_lines,
+)
 COMPILED = [getattr(module, name) for module in MODULES for name in dir(module)]
 
 

@@ -10,7 +10,14 @@ from scipy.stats import chi2
 from estimators.geometry import transform
 from estimators.messages import FloatArray, PoseIncrement, RangeFrame
 from estimators.range_gate import HorizontalRanges
-from estimators.relocation.search import BLOCKED_LOSS, SHORT_LIMIT, find_pose, too_short, total_loss
+from estimators.relocation.search import (
+    BLOCKED_LOSS,
+    SHORT_LIMIT,
+    find_pose,
+    residuals_at,
+    too_short,
+    total_loss,
+)
 from estimators.relocation.window import PlacedRanges, Window
 from tests.estimators.matched_world import pose_error
 from tests.estimators.relocation.wandering_robot import ROOM, Robot, clear
@@ -56,7 +63,7 @@ def test_loss_is_what_it_says(seed: int) -> None:
     placed, _ = placed_by(Robot(ROOM, seed), 2.0)
     poses = np.random.default_rng(seed).uniform([0.0, 0.0, -3.0], [8.0, 7.0, 3.0], (4, 3))
     expected = [loss_in_plain_words(placed, pose) for pose in poses]
-    np.testing.assert_allclose(total_loss(placed, poses), expected, rtol=1e-9)
+    np.testing.assert_allclose(total_loss(residuals_at(placed, poses)), expected, rtol=1e-9)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -69,7 +76,7 @@ def test_the_minimum_is_the_one_that_a_global_optimiser_finds(seed: int) -> None
     assert found is not None
 
     def loss(pose: FloatArray) -> float:
-        return float(total_loss(placed, pose[None])[0])
+        return float(total_loss(residuals_at(placed, pose[None]))[0])
 
     reference = differential_evolution(
         loss,
@@ -162,8 +169,9 @@ def _with_step_off(placed: PlacedRanges, k: int, axis: int, size: float) -> Plac
 
 def test_share_of_ranges_too_short_is_none_at_the_right_pose_and_many_at_a_wrong_one() -> None:
     placed, keyframe = placed_by(Robot(ROOM, 4, lambda _, i, __: 1.0 if i == 1 else 0.0), 4.0)
-    assert too_short(placed, keyframe) < 0.02
-    assert too_short(placed, keyframe + np.array([1.0, 0.0, 0.0])) > 0.2
+    wrong = keyframe + np.array([1.0, 0.0, 0.0])
+    assert too_short(residuals_at(placed, keyframe[None])) < 0.02
+    assert too_short(residuals_at(placed, wrong[None])) > 0.2
 
 
 def test_ranges_of_one_anchor_give_no_pose() -> None:

@@ -136,6 +136,46 @@ def test_verdicts_name_what_cannot_be_used() -> None:
     assert way.add_increment(replace(step(5, 11, 0.1, False), cov=np.zeros((3, 3)))) is Verdict.IMPOSSIBLE
 
 
+def test_what_can_be_used_of_a_frame_is_placed() -> None:
+    way = window()
+    bad = range_frame(50_000_000, [77, 1, 3, 2], [4.0, 4.0, np.nan, 5.0])
+    take(way, founding(0), bad, step(0, 1, 0.1, False))
+    placed = way.ranges_since(5.0)
+    assert placed is not None
+    np.testing.assert_array_equal(placed.anchor_ids, [1, 2])
+    np.testing.assert_array_equal(placed.anchors, [ROOM.anchors[i][:2] for i in (1, 2)])
+    assert np.isfinite(placed.sigmas).all()
+
+
+def test_between_two_headings_a_tag_turns_the_shorter_way() -> None:
+    way = window()
+    turns = [
+        replace(step(0, k, 0.0, False), increment=np.array([0.0, 0.0, yaw]))
+        for k, yaw in ((1, 3.1), (2, -3.1))
+    ]
+    take(way, founding(0), turns[0], frame(150), turns[1])
+    np.testing.assert_allclose(tags_of(way)[0], -ROOM.tag_in_body[:2], atol=1e-12)
+
+
+def test_every_step_since_a_range_adds_its_shift_and_its_turn_by_the_distance_from_its_end() -> None:
+    rng, way = np.random.default_rng(4), window()
+    take(way, founding(0))
+    for k in range(1, 9):
+        root = 0.05 * rng.standard_normal((3, 3))
+        moved = rng.normal(0.3, 0.2, 3)
+        take(way, frame(100 * k - 50), replace(step(k - 1, k, 0.0, True), increment=moved, cov=root @ root.T))
+    placed = way.ranges_since(5.0)
+    assert placed is not None
+    expected = np.array(
+        [HorizontalRanges(0.1, ROOM).of(frame(0), np.zeros(3), 0.0).rows[:, 3] ** 2] * 8
+    ).ravel()
+    for i, tag in enumerate(placed.tags):
+        for end, cov in zip(placed.step_ends[: placed.steps[i]], placed.step_covs, strict=False):
+            expected[i] += 0.5 * (cov[0, 0] + cov[1, 1] + cov[2, 2] * ((tag - end) ** 2).sum())
+    np.testing.assert_allclose(placed.sigmas**2, expected, rtol=1e-12)
+    assert placed.steps.tolist() == [k for k in range(8, 0, -1) for _ in range(2)]
+
+
 def test_drift_widens_the_sigma_of_ranges_that_lie_behind_it() -> None:
     way = window()
     rough = replace(step(0, 1, 0.1, True), cov=np.diag([0.04, 0.04, 0.01]))
