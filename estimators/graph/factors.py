@@ -148,6 +148,11 @@ def motions(
     return rows
 
 
+def motion(first: int, second: int, dt: float, accel_noise: float, yaw_accel_noise: float) -> FloatArray:
+    """As `motions`, (1, 7), where they come one by one."""
+    return np.array([[first, first + 1, second, second + 1, dt, accel_noise, yaw_accel_noise]])
+
+
 def priors(variable: ArrayLike, at: ArrayLike, information: ArrayLike, is_pose: bool) -> FloatArray:
     """Factors on single variables: a start, a surveyed anchor, a measured heading.
 

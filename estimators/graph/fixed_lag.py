@@ -45,13 +45,11 @@ class _Settled:
         nodes: how many it had.
         rows: how many factors, by the name of their table.
         said: what all of them said of its newest state, and of a reference.
-        poses: (K,) which of those variables are poses: motion is linear in velocities.
     """
 
     nodes: int
     rows: dict[str, int]
     said: DensePrior
-    poses: BoolArray
 
 
 class FixedLag:
@@ -76,6 +74,7 @@ class FixedLag:
         self._tolerance = tolerance
         self.graph = Graph(known.copy(), np.zeros_like(known))
         self.stamps_ns = np.empty(0, dtype=np.int64)
+        self._room: dict[str, FloatArray] = {}
         self._settled: _Settled | None = None
 
     def variable(self, node: int) -> int:
@@ -129,9 +128,9 @@ class FixedLag:
             graph.values = np.insert(graph.values, at, state, axis=0)
             self.stamps_ns = np.insert(self.stamps_ns, node, stamp_ns)
         else:
-            graph.values = np.concatenate([graph.values, state])
+            self._append("values", state)
             self.stamps_ns = np.concatenate([self.stamps_ns, [stamp_ns]])
-        graph.free = np.concatenate([graph.free, self._all_free])
+        self._append("free", self._all_free)
         return node
 
     def interpolate(self, stamp_ns: int) -> int | None:
@@ -157,7 +156,7 @@ class FixedLag:
     def add(self, **tables: FloatArray) -> None:
         """Add factors, rows of `estimators.graph.factors` by the name of their table in the graph."""
         for name, rows in tables.items():
-            setattr(self.graph, name, np.concatenate([getattr(self.graph, name), rows]))
+            self._append(name, rows)
 
     def drop_before(self, horizon_ns: int, kept_ns: Collection[int] = ()) -> bool:
         """Marginalise what is older than the horizon, once the last update was one of the whole window.
@@ -213,8 +212,7 @@ class FixedLag:
     def _settle(self, said: DensePrior) -> None:
         """Note what the window says now that all of it was solved."""
         rows = {name: len(getattr(self.graph, name)) for name in _TABLES}
-        poses = (said.variables - self._known) % self._width == 0
-        self._settled = _Settled(len(self.stamps_ns), rows, said, poses)
+        self._settled = _Settled(len(self.stamps_ns), rows, said)
 
     def state_of(self, node: int) -> tuple[FloatArray, FloatArray]:
         """State (3 width,) of any node and its covariance, given all that is in the window.
@@ -242,7 +240,7 @@ class FixedLag:
         settled, graph = self._settled, self.graph
         if settled is None or not self._has_new() or len(self.stamps_ns) - settled.nodes > _MOST_NEW:
             return None
-        said, values, rows = settled.said, graph.values.copy(), settled.rows
+        said, rows = settled.said, settled.rows
         newer = (
             graph.free,
             graph.increments[rows["increments"] :],
@@ -255,17 +253,18 @@ class FixedLag:
             said.information,
             said.gradient,
         )
-        first = self.variable(settled.nodes)
-        status, covariance, _ = optimise.solve_window(
-            values, newer, asked, self._known, first, self._iterations, self._tolerance
+        status, covariance = optimise.solve_newest(
+            graph.values,
+            newer,
+            asked,
+            self._known,
+            self._width,
+            self.variable(settled.nodes),
+            self._iterations,
+            self._tolerance,
+            _FARTHEST * self._tolerance,
         )
-        if status not in (optimise.CONVERGED, optimise.NOT_CONVERGED):
-            return None
-        moved = np.abs(values[said.variables] - said.at)[settled.poses]
-        if moved.max() > _FARTHEST * self._tolerance:
-            return None
-        graph.values = values
-        return covariance
+        return covariance if status in (optimise.CONVERGED, optimise.NOT_CONVERGED) else None
 
     def _solve_all(self, asked: IntArray, iterations: int) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Values (V, 3) at the optimum; covariance of the variables asked for, and its inverse."""
@@ -306,6 +305,17 @@ class FixedLag:
         self.stamps_ns = self.stamps_ns[~leaving]
         if settled is not None and not everything and not gone[settled.said.variables].any():
             self._settle(replace(settled.said, variables=numbers[settled.said.variables]))
+
+    def _append(self, name: str, rows: FloatArray) -> None:
+        """Put rows behind those of an array of the graph, into room that was left for them."""
+        there, room = getattr(self.graph, name), self._room.get(name)
+        begin, end = len(there), len(there) + len(rows)
+        # An array that has been replaced since has no room.
+        if room is None or there.base is not room or end > len(room):
+            room = self._room[name] = np.empty((2 * end, there.shape[1]))
+            room[:begin] = there
+        room[begin:end] = rows
+        setattr(self.graph, name, room[:end])
 
     def _renumber(self, numbers: IntArray) -> None:
         """Give every variable a new number (V,), in tables and prior."""

@@ -34,6 +34,9 @@ POSE, VELOCITY, REFERENCE, STATE = slice(0, 3), slice(3, 6), slice(6, 9), slice(
 _WIDEST = np.array([100.0, 100.0, np.pi, 10.0, 10.0, 10.0])
 """Standard deviations [m, rad, m/s, rad/s] beyond which a window that begins anew knows nothing at all."""
 
+_OF_NODE = {"increments": 1, "ranges": 0, "sightings": 0}
+"""Column of each table for the node of the instant at which a factor was measured."""
+
 _TAKES: frozenset[type[Measurement]] = frozenset(
     {RangeFrame, LandmarkFrame, PoseIncrement, LoopClosure, Scan}
 )
@@ -261,10 +264,10 @@ class GraphSmoother(KeyframeTracker):
         return self._take(measured.stamp_ns, "increments", rows)
 
     def _take(self, stamp_ns: int, table: str, rows: FloatArray) -> bool:
-        """Add factors on the node of an instant, which has the number -1 in them, and solve."""
+        """Add factors on the node of an instant, whose number is not in them yet, and solve."""
         node = self._node_of(stamp_ns)
         assert node is not None
-        rows[:, :2] = np.where(rows[:, :2] < 0, self._window.variable(node), rows[:, :2])
+        rows[:, _OF_NODE[table]] = self._window.variable(node)
         self._window.add(**{table: rows})
         return self._solve()
 
@@ -327,7 +330,7 @@ class GraphSmoother(KeyframeTracker):
         self._mean, self._cov = self._predicted(stamp_ns)
         node = window.insert(stamp_ns, self._guess(stamp_ns))
         ends = window.variable(node - 1), window.variable(node)
-        window.add(motions=factors.motions(*ends, (stamp_ns - newest_ns) * 1e-9, *self._accel_noise))
+        window.add(motions=factors.motion(*ends, (stamp_ns - newest_ns) * 1e-9, *self._accel_noise))
         return node
 
     def _guess(self, stamp_ns: int) -> FloatArray:  # noqa: ARG002

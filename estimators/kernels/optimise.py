@@ -217,3 +217,46 @@ def solve_window(
     root = _last_root(system[1], system[2], diagonal, below, len(asked))
     inverse = np.linalg.inv(root)
     return status, inverse.T @ inverse, root @ root.T
+
+
+@compiled(
+    f"Tuple((int64, {MATRIX}))"
+    f"({MATRIX}, {GRAPH}, {INDICES}, int64, int64, int64, int64, float64, float64)"
+)
+def solve_newest(
+    values: FloatArray,
+    graph: GraphArrays,
+    asked: IntArray,
+    known: int,
+    width: int,
+    first: int,
+    iterations: int,
+    tolerance: float,
+    farthest: float,
+) -> tuple[int, FloatArray]:
+    """As `solve_window`, but values stay as they are unless the dense prior is still good at the optimum.
+
+    Args:
+        values: (V, 3).
+        graph: factors.
+        asked: (K,) variables whose covariance is asked for.
+        known: so many variables, the first, are known.
+        width: variables of a node, the first of which is its pose.
+        first: the first new one.
+        iterations: as in `gauss_newton`.
+        tolerance: likewise.
+        farthest: `OUT_OF_REACH` is told where a pose would be farther than this from where the dense prior was
+            linearised. Velocities may be: motion is linear in them.
+
+    Returns:
+        The status; covariance (3 K, 3 K) of the variables asked for.
+    """
+    moved, dense, dense_at = values.copy(), graph[6], graph[7]
+    status, covariance, _ = solve_window(moved, graph, asked, known, first, iterations, tolerance)
+    if status in (CONVERGED, NOT_CONVERGED):
+        for k in range(len(dense)):
+            is_pose = (dense[k] - known) % width == 0
+            if is_pose and np.abs(moved[dense[k]] - dense_at[k]).max() > farthest:
+                return OUT_OF_REACH, covariance
+        values[:] = moved
+    return status, covariance
