@@ -24,7 +24,6 @@ from estimators.graph.errors import GraphError
 from estimators.graph.factors import DensePrior, Graph
 from estimators.graph.solver import arrays
 from estimators.kernels import optimise, window
-from estimators.kernels.factors import system_of
 from estimators.kernels.window import BoolArray
 from estimators.messages import FloatArray, IntArray
 
@@ -253,7 +252,7 @@ class FixedLag:
             said.information,
             said.gradient,
         )
-        status, covariance = optimise.solve_newest(
+        status, covariance = window.solve_newest(
             graph.values,
             newer,
             asked,
@@ -269,7 +268,7 @@ class FixedLag:
     def _solve_all(self, asked: IntArray, iterations: int) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Values (V, 3) at the optimum; covariance of the variables asked for, and its inverse."""
         values = self.graph.values.copy()
-        status, covariance, information = optimise.solve_window(
+        status, covariance, information = window.solve_window(
             values, arrays(self.graph), asked, self._known, self._known, iterations, self._tolerance
         )
         if status not in (optimise.CONVERGED, optimise.NOT_CONVERGED):
@@ -279,32 +278,15 @@ class FixedLag:
     def _marginalise(self, leaving: BoolArray, everything: bool = False) -> None:
         """Linearise the factors on nodes that leave, or all factors, and keep what they say of the rest."""
         settled, self._settled = self._settled, None
-        graph, count = self.graph, len(self.graph.values)
-        gone = np.zeros(count, dtype=np.bool_)
-        gone[self._known :] = np.repeat(leaving, self._width)
-        numbers = np.cumsum(~gone) - 1
-        touched = gone.copy()
-        touched[graph.dense.variables] = True
-        part = Graph(graph.values, graph.free, dense=graph.dense)
-        for name, columns in _TABLES.items():
-            table = getattr(graph, name)
-            if len(table):
-                goes = np.ones(count, dtype=np.bool_) if everything else gone
-                taken, rest = window.divide(table, columns, goes, touched, numbers)
-                setattr(part, name, taken)
-                setattr(graph, name, rest)
-        touched[: self._known] = False
-        staying, eliminated = np.flatnonzero(touched & ~gone), int(gone.sum())
-        order = np.full(count, -1, dtype=np.int64)
-        order[gone] = np.arange(eliminated)
-        order[staying] = eliminated + np.arange(len(staying))
-        system = system_of(arrays(part), order, eliminated + len(staying))
-        _, information, gradient = optimise.marginalise(graph.values, arrays(part), system, eliminated)
-        graph.dense = DensePrior(numbers[staying], graph.values[staying], information, gradient)
-        graph.values, graph.free = graph.values[~gone], graph.free[~gone]
+        values, kept, numbers = window.forget(
+            self.graph.values, arrays(self.graph), leaving, self._known, self._width, everything
+        )
+        self.graph = Graph(values, *kept[:6], DensePrior(*kept[6:]))
         self.stamps_ns = self.stamps_ns[~leaving]
-        if settled is not None and not everything and not gone[settled.said.variables].any():
-            self._settle(replace(settled.said, variables=numbers[settled.said.variables]))
+        if settled is not None and not everything:
+            said = settled.said
+            if not leaving[(said.variables - self._known) // self._width].any():
+                self._settle(replace(said, variables=numbers[said.variables]))
 
     def _append(self, name: str, rows: FloatArray) -> None:
         """Put rows behind those of an array of the graph, into room that was left for them."""
