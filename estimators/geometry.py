@@ -107,8 +107,6 @@ def transform_each(T_a_b: FloatArray, points_b: FloatArray) -> FloatArray:
 
 def lift(planar: FloatArray, z: float) -> FloatArray:
     """4x4 transform of a level body at (x, y, yaw) and height `z` [m]."""
-    T = np.eye(4)
-    T[:2, :2] = rotation(planar[2])
-    T[:2, 3] = planar[:2]
-    T[2, 3] = z
-    return T
+    x, y, yaw = planar.tolist()
+    c, s = cos(yaw), sin(yaw)
+    return np.array([[c, -s, 0.0, x], [s, c, 0.0, y], [0.0, 0.0, 1.0, z], [0.0, 0.0, 0.0, 1.0]])

@@ -5,6 +5,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from estimators.kernels.algebra import solve_lower
 from estimators.kernels.block_cholesky import BLOCKS
 from estimators.kernels.compilation import INDICES, MATRIX, compiled
 from estimators.kernels.factors import GRAPH, GraphArrays, last_use, system_of
@@ -82,13 +83,14 @@ def solve_window(
     if status not in (CONVERGED, NOT_CONVERGED) or not np.isfinite(values).all():
         return (NOT_FINITE if status < 0 else status), nothing, nothing
     root = _last_root(system[1], system[2], diagonal, below, len(asked))
-    inverse = np.linalg.inv(root)
-    return status, inverse.T @ inverse, root @ root.T
+    inverse, eye = np.empty_like(root), np.eye(len(root))
+    for k in range(len(root)):
+        inverse[k] = solve_lower(root, eye[k])
+    return status, inverse @ inverse.T, root @ root.T
 
 
 @compiled(
-    f"Tuple((int64, {MATRIX}))"
-    f"({MATRIX}, {GRAPH}, {INDICES}, int64, int64, int64, int64, float64, float64)"
+    f"Tuple((int64, {MATRIX}))({MATRIX}, {GRAPH}, {INDICES}, int64, int64, int64, int64, float64, float64)"
 )
 def solve_newest(
     values: FloatArray,
@@ -112,8 +114,8 @@ def solve_newest(
         first: the first new one.
         iterations: as in `gauss_newton`.
         tolerance: likewise.
-        farthest: `OUT_OF_REACH` is told where a pose would be farther than this from where the dense prior was
-            linearised. Velocities may be: motion is linear in them.
+        farthest: `OUT_OF_REACH` is told where a pose would be farther than this from where the dense prior
+            was linearised. Velocities may be: motion is linear in them.
 
     Returns:
         The status; covariance (3 K, 3 K) of the variables asked for.

@@ -125,8 +125,9 @@ class KeyframeTracker(ABC):
             planar[2, :2] = planar[:2, 2] = 0.0
             planar[2, 2] = np.inf
         # It walks level: what it does upward is as uncertain as its height within a second.
-        velocity_cov = np.diag([0.0, 0.0, self._setup.height_sigma**2])
+        velocity_cov = np.zeros((3, 3))
         velocity_cov[:2, :2] = cov[3:5, 3:5]
+        velocity_cov[2, 2] = self._setup.height_sigma**2
         return PoseEstimate(
             stamp_ns,
             lift(state[:3], self._setup.height),
