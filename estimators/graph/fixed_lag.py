@@ -73,7 +73,7 @@ class FixedLag:
         self._tolerance = tolerance
         self.graph = Graph(known.copy(), np.zeros_like(known))
         self.stamps_ns = np.empty(0, dtype=np.int64)
-        self._room: dict[str, FloatArray] = {}
+        self._room: dict[str, FloatArray | IntArray] = {}
         self._settled: _Settled | None = None
 
     def variable(self, node: int) -> int:
@@ -127,9 +127,9 @@ class FixedLag:
             graph.values = np.insert(graph.values, at, state, axis=0)
             self.stamps_ns = np.insert(self.stamps_ns, node, stamp_ns)
         else:
-            self._append("values", state)
-            self.stamps_ns = np.concatenate([self.stamps_ns, [stamp_ns]])
-        self._append("free", self._all_free)
+            self._append(graph, "values", state)
+            self._append(self, "stamps_ns", [stamp_ns])
+        self._append(graph, "free", self._all_free)
         return node
 
     def interpolate(self, stamp_ns: int) -> int | None:
@@ -155,7 +155,7 @@ class FixedLag:
     def add(self, **tables: FloatArray) -> None:
         """Add factors, rows of `estimators.graph.factors` by the name of their table in the graph."""
         for name, rows in tables.items():
-            self._append(name, rows)
+            self._append(self.graph, name, rows)
 
     def drop_before(self, horizon_ns: int, kept_ns: Collection[int] = ()) -> bool:
         """Marginalise what is older than the horizon, once the last update was one of the whole window.
@@ -268,12 +268,12 @@ class FixedLag:
     def _solve_all(self, asked: IntArray, iterations: int) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Values (V, 3) at the optimum; covariance of the variables asked for, and its inverse."""
         values = self.graph.values.copy()
-        status, covariance, information = window.solve_window(
+        status, covariance, root = window.solve_window(
             values, arrays(self.graph), asked, self._known, self._known, iterations, self._tolerance
         )
         if status not in (optimise.CONVERGED, optimise.NOT_CONVERGED):
             raise GraphError("window: something in it is not determined, or not finite")
-        return values, covariance, information
+        return values, covariance, root @ root.T
 
     def _marginalise(self, leaving: BoolArray, everything: bool = False) -> None:
         """Linearise the factors on nodes that leave, or all factors, and keep what they say of the rest."""
@@ -288,16 +288,16 @@ class FixedLag:
             if not leaving[(said.variables - self._known) // self._width].any():
                 self._settle(replace(said, variables=numbers[said.variables]))
 
-    def _append(self, name: str, rows: FloatArray) -> None:
-        """Put rows behind those of an array of the graph, into room that was left for them."""
-        there, room = getattr(self.graph, name), self._room.get(name)
+    def _append(self, owner: "FixedLag | Graph", name: str, rows: FloatArray | list[int]) -> None:
+        """Put rows behind those of an array that window or graph has, into room that was left for them."""
+        there, room = getattr(owner, name), self._room.get(name)
         begin, end = len(there), len(there) + len(rows)
         # An array that has been replaced since has no room.
         if room is None or there.base is not room or end > len(room):
-            room = self._room[name] = np.empty((2 * end, there.shape[1]))
+            room = self._room[name] = np.empty((2 * end, *there.shape[1:]), dtype=there.dtype)
             room[:begin] = there
         room[begin:end] = rows
-        setattr(self.graph, name, room[:end])
+        setattr(owner, name, room[:end])
 
     def _renumber(self, numbers: IntArray) -> None:
         """Give every variable a new number (V,), in tables and prior."""

@@ -61,7 +61,7 @@ def solve_window(
 
     Returns:
         As `gauss_newton` a status, which is `OUT_OF_REACH` where a factor is on a variable that is not solved
-        for; covariance (3 K, 3 K) of the variables asked for; its inverse.
+        for; covariance (3 K, 3 K) of the variables asked for; the lower root of its inverse.
     """
     nothing = np.empty((0, 0))
     dense = graph[6]
@@ -83,10 +83,15 @@ def solve_window(
     if status not in (CONVERGED, NOT_CONVERGED) or not np.isfinite(values).all():
         return (NOT_FINITE if status < 0 else status), nothing, nothing
     root = _last_root(system[1], system[2], diagonal, below, len(asked))
-    inverse, eye = np.empty_like(root), np.eye(len(root))
-    for k in range(len(root)):
-        inverse[k] = solve_lower(root, eye[k])
-    return status, inverse @ inverse.T, root @ root.T
+    inverse, eye, covariance = np.empty_like(root), np.eye(len(root)), np.empty_like(root)
+    for j in range(len(root)):
+        inverse[j] = solve_lower(root, eye[j])
+        for k in range(j + 1):
+            total = 0.0
+            for i in range(j, len(root)):
+                total += inverse[j, i] * inverse[k, i]
+            covariance[j, k] = covariance[k, j] = total
+    return status, covariance, root
 
 
 @compiled(
