@@ -1,6 +1,7 @@
 """Odometry increments from a known start, in stamp order: what every estimator on them does alike."""
 
 from abc import ABC, abstractmethod
+from math import isfinite
 
 import numpy as np
 from pydantic import Field
@@ -170,5 +171,12 @@ class KeyframeTracker(ABC):
 
 
 def is_covariance(cov: FloatArray) -> bool:
-    """Whether a matrix is finite and positive definite."""
-    return bool(np.isfinite(cov).all() and np.linalg.eigvalsh(cov)[0] > 0.0)
+    """Whether a matrix (3, 3) is finite and positive definite: its pivots are positive."""
+    numbers = cov.ravel().tolist()
+    if not all(map(isfinite, numbers)):
+        return False
+    xx, _, _, xy, yy, _, xz, yz, zz = numbers
+    if xx <= 0.0:
+        return False
+    second = yy - xy * xy / xx
+    return second > 0.0 and zz - xz * xz / xx - (yz - xy * xz / xx) ** 2 / second > 0.0
