@@ -90,6 +90,13 @@ def ranges(
     return rows
 
 
+def horizontal_range(
+    anchor: int, measured: float, sigma: float, arm_x: float, arm_y: float
+) -> tuple[float, ...]:
+    """Row as of `ranges` for a range in the plane whose pose is not known yet."""
+    return -1.0, anchor, measured, sigma, arm_x, arm_y, 0.0, GAUSSIAN.kind, GAUSSIAN.scale
+
+
 def sightings(
     pose: ArrayLike,
     landmark: ArrayLike,
@@ -146,6 +153,11 @@ def motions(
     rows[:, 0], rows[:, 1], rows[:, 2], rows[:, 3] = first, first + 1, second, second + 1
     rows[:, 4], rows[:, 5], rows[:, 6] = dt, accel_noise, yaw_accel_noise
     return rows
+
+
+def motion(first: int, second: int, dt: float, accel_noise: float, yaw_accel_noise: float) -> FloatArray:
+    """As `motions`, (1, 7), where they come one by one."""
+    return np.array([[first, first + 1, second, second + 1, dt, accel_noise, yaw_accel_noise]])
 
 
 def priors(variable: ArrayLike, at: ArrayLike, information: ArrayLike, is_pose: bool) -> FloatArray:

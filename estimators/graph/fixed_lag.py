@@ -24,7 +24,6 @@ from estimators.graph.errors import GraphError
 from estimators.graph.factors import DensePrior, Graph
 from estimators.graph.solver import arrays
 from estimators.kernels import optimise, window
-from estimators.kernels.factors import system_of
 from estimators.kernels.window import BoolArray
 from estimators.messages import FloatArray, IntArray
 
@@ -45,13 +44,11 @@ class _Settled:
         nodes: how many it had.
         rows: how many factors, by the name of their table.
         said: what all of them said of its newest state, and of a reference.
-        poses: (K,) which of those variables are poses: motion is linear in velocities.
     """
 
     nodes: int
     rows: dict[str, int]
     said: DensePrior
-    poses: BoolArray
 
 
 class FixedLag:
@@ -76,6 +73,7 @@ class FixedLag:
         self._tolerance = tolerance
         self.graph = Graph(known.copy(), np.zeros_like(known))
         self.stamps_ns = np.empty(0, dtype=np.int64)
+        self._room: dict[str, FloatArray | IntArray] = {}
         self._settled: _Settled | None = None
 
     def variable(self, node: int) -> int:
@@ -129,9 +127,9 @@ class FixedLag:
             graph.values = np.insert(graph.values, at, state, axis=0)
             self.stamps_ns = np.insert(self.stamps_ns, node, stamp_ns)
         else:
-            graph.values = np.concatenate([graph.values, state])
-            self.stamps_ns = np.concatenate([self.stamps_ns, [stamp_ns]])
-        graph.free = np.concatenate([graph.free, self._all_free])
+            self._append(graph, "values", state)
+            self._append(self, "stamps_ns", [stamp_ns])
+        self._append(graph, "free", self._all_free)
         return node
 
     def interpolate(self, stamp_ns: int) -> int | None:
@@ -157,7 +155,7 @@ class FixedLag:
     def add(self, **tables: FloatArray) -> None:
         """Add factors, rows of `estimators.graph.factors` by the name of their table in the graph."""
         for name, rows in tables.items():
-            setattr(self.graph, name, np.concatenate([getattr(self.graph, name), rows]))
+            self._append(self.graph, name, rows)
 
     def drop_before(self, horizon_ns: int, kept_ns: Collection[int] = ()) -> bool:
         """Marginalise what is older than the horizon, once the last update was one of the whole window.
@@ -213,8 +211,7 @@ class FixedLag:
     def _settle(self, said: DensePrior) -> None:
         """Note what the window says now that all of it was solved."""
         rows = {name: len(getattr(self.graph, name)) for name in _TABLES}
-        poses = (said.variables - self._known) % self._width == 0
-        self._settled = _Settled(len(self.stamps_ns), rows, said, poses)
+        self._settled = _Settled(len(self.stamps_ns), rows, said)
 
     def state_of(self, node: int) -> tuple[FloatArray, FloatArray]:
         """State (3 width,) of any node and its covariance, given all that is in the window.
@@ -242,7 +239,7 @@ class FixedLag:
         settled, graph = self._settled, self.graph
         if settled is None or not self._has_new() or len(self.stamps_ns) - settled.nodes > _MOST_NEW:
             return None
-        said, values, rows = settled.said, graph.values.copy(), settled.rows
+        said, rows = settled.said, settled.rows
         newer = (
             graph.free,
             graph.increments[rows["increments"] :],
@@ -255,57 +252,52 @@ class FixedLag:
             said.information,
             said.gradient,
         )
-        first = self.variable(settled.nodes)
-        status, covariance, _ = optimise.solve_window(
-            values, newer, asked, self._known, first, self._iterations, self._tolerance
+        status, covariance = window.solve_newest(
+            graph.values,
+            newer,
+            asked,
+            self._known,
+            self._width,
+            self.variable(settled.nodes),
+            self._iterations,
+            self._tolerance,
+            _FARTHEST * self._tolerance,
         )
-        if status not in (optimise.CONVERGED, optimise.NOT_CONVERGED):
-            return None
-        moved = np.abs(values[said.variables] - said.at)[settled.poses]
-        if moved.max() > _FARTHEST * self._tolerance:
-            return None
-        graph.values = values
-        return covariance
+        return covariance if status in (optimise.CONVERGED, optimise.NOT_CONVERGED) else None
 
     def _solve_all(self, asked: IntArray, iterations: int) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Values (V, 3) at the optimum; covariance of the variables asked for, and its inverse."""
         values = self.graph.values.copy()
-        status, covariance, information = optimise.solve_window(
+        status, covariance, root = window.solve_window(
             values, arrays(self.graph), asked, self._known, self._known, iterations, self._tolerance
         )
         if status not in (optimise.CONVERGED, optimise.NOT_CONVERGED):
             raise GraphError("window: something in it is not determined, or not finite")
-        return values, covariance, information
+        return values, covariance, root @ root.T
 
     def _marginalise(self, leaving: BoolArray, everything: bool = False) -> None:
         """Linearise the factors on nodes that leave, or all factors, and keep what they say of the rest."""
         settled, self._settled = self._settled, None
-        graph, count = self.graph, len(self.graph.values)
-        gone = np.zeros(count, dtype=np.bool_)
-        gone[self._known :] = np.repeat(leaving, self._width)
-        numbers = np.cumsum(~gone) - 1
-        touched = gone.copy()
-        touched[graph.dense.variables] = True
-        part = Graph(graph.values, graph.free, dense=graph.dense)
-        for name, columns in _TABLES.items():
-            table = getattr(graph, name)
-            if len(table):
-                goes = np.ones(count, dtype=np.bool_) if everything else gone
-                taken, rest = window.divide(table, columns, goes, touched, numbers)
-                setattr(part, name, taken)
-                setattr(graph, name, rest)
-        touched[: self._known] = False
-        staying, eliminated = np.flatnonzero(touched & ~gone), int(gone.sum())
-        order = np.full(count, -1, dtype=np.int64)
-        order[gone] = np.arange(eliminated)
-        order[staying] = eliminated + np.arange(len(staying))
-        system = system_of(arrays(part), order, eliminated + len(staying))
-        _, information, gradient = optimise.marginalise(graph.values, arrays(part), system, eliminated)
-        graph.dense = DensePrior(numbers[staying], graph.values[staying], information, gradient)
-        graph.values, graph.free = graph.values[~gone], graph.free[~gone]
+        values, kept, numbers = window.forget(
+            self.graph.values, arrays(self.graph), leaving, self._known, self._width, everything
+        )
+        self.graph = Graph(values, *kept[:6], DensePrior(*kept[6:]))
         self.stamps_ns = self.stamps_ns[~leaving]
-        if settled is not None and not everything and not gone[settled.said.variables].any():
-            self._settle(replace(settled.said, variables=numbers[settled.said.variables]))
+        if settled is not None and not everything:
+            said = settled.said
+            if not leaving[(said.variables - self._known) // self._width].any():
+                self._settle(replace(said, variables=numbers[said.variables]))
+
+    def _append(self, owner: "FixedLag | Graph", name: str, rows: FloatArray | list[int]) -> None:
+        """Put rows behind those of an array that window or graph has, into room that was left for them."""
+        there, room = getattr(owner, name), self._room.get(name)
+        begin, end = len(there), len(there) + len(rows)
+        # An array that has been replaced since has no room.
+        if room is None or there.base is not room or end > len(room):
+            room = self._room[name] = np.empty((2 * end, *there.shape[1:]), dtype=there.dtype)
+            room[:begin] = there
+        room[begin:end] = rows
+        setattr(owner, name, room[:end])
 
     def _renumber(self, numbers: IntArray) -> None:
         """Give every variable a new number (V,), in tables and prior."""

@@ -13,9 +13,8 @@ from estimators.base import Report, Verdict
 from estimators.geometry import wrap_angle
 from estimators.graph import factors
 from estimators.landmark_gate import LandmarkGate
-from estimators.messages import FloatArray, LandmarkFrame, LoopClosure, PoseIncrement, RangeFrame
+from estimators.messages import FloatArray, LandmarkFrame, RangeFrame
 from estimators.models.landmark import range_and_bearing
-from estimators.models.motion import increment
 from estimators.models.range import horizontal_range
 from estimators.range_gate import HorizontalRanges, RangeGate
 
@@ -60,7 +59,7 @@ def judge_ranges(
         numbers: anchor id -> variable in the graph.
 
     Returns:
-        The report; rows of `factors.ranges`, -1 for the pose.
+        The report; rows of `factors.ranges`, whose pose is not known yet.
     """
     residuals, nis = np.full((2, len(frame.ranges)), np.nan)
     believed = []
@@ -89,7 +88,7 @@ def believed_ranges(
     arm: FloatArray,
     numbers: Mapping[int, int],
 ) -> FloatArray:
-    """Ranges that a filter accepted as rows of `factors.ranges`, -1 for the pose.
+    """Ranges that a filter accepted as rows of `factors.ranges`, whose pose is not known yet.
 
     Those that it weighed down are not among them: a verdict does not tell by how much.
 
@@ -146,39 +145,8 @@ def judge_landmarks(
     return Verdict.ACCEPTED, factors.sightings(-1, *np.array(rows).T)
 
 
-def motion_nis(
-    measured: PoseIncrement | LoopClosure, reference: FloatArray, pose: FloatArray, cov: FloatArray
-) -> float:
-    """Normalised innovation squared of a motion between two poses that are known together.
-
-    Args:
-        measured: the motion.
-        reference: (3,) pose where it begins.
-        pose: (3,) pose where it ends.
-        cov: (9, 9) covariance of this pose, its velocity and the reference.
-    """
-    predicted, by_reference, by_pose = increment(reference, pose)
-    H = np.zeros((3, 9))
-    H[:, :3], H[:, 6:] = by_pose, by_reference
-    return increment_nis(measured, predicted, H @ cov @ H.T)
-
-
-def increment_nis(measured: PoseIncrement | LoopClosure, predicted: FloatArray, spread: FloatArray) -> float:
-    """Normalised innovation squared of a motion.
-
-    Args:
-        measured: the motion.
-        predicted: (3,) what it was thought to be.
-        spread: (3, 3) covariance of that.
-    """
-    residual = measured.increment - predicted
-    residual[2] = wrap_angle(residual[2])
-    return float(residual @ np.linalg.solve(spread + measured.cov, residual))
-
-
 def _range_rows(believed: Sequence[tuple[int, float, float]], arm: FloatArray) -> FloatArray:
     """Rows of `factors.ranges` from variables of anchors, horizontal ranges and their sigmas [m]."""
-    if not believed:
-        return np.empty((0, factors.RANGE))
-    anchors, measured, sigmas = np.array(believed).T
-    return factors.ranges(-1, anchors, measured, sigmas, arm[:2])
+    arm_xy = arm[:2].tolist()
+    rows = [factors.horizontal_range(*item, *arm_xy) for item in believed]
+    return np.array(rows, dtype=np.float64).reshape(-1, factors.RANGE)

@@ -10,8 +10,8 @@ from estimators.messages import FloatArray
 
 _LIMIT = float(chi2.ppf(1.0 - 1e-6, 3))
 """What a covariance explains of a correction, but for one in a million."""
-_LEAST = (0.05, 0.05, radians(2.0))
-"""Corrections below these [m, m, rad] are no jump, however sure the estimate was."""
+_LEAST, _LEAST_TURN = 0.05, radians(2.0)
+"""Corrections below these [m, rad] are no jump, however sure the estimate was."""
 
 
 def is_jump(before: FloatArray, cov: FloatArray, after: FloatArray) -> bool:
@@ -24,8 +24,9 @@ def is_jump(before: FloatArray, cov: FloatArray, after: FloatArray) -> bool:
         cov: (3, 3) its covariance then.
         after: (3,) the same pose now that more is known.
     """
-    step = after - before
-    step[2] = wrap_angle(step[2])
-    if all(abs(moved) <= least for moved, least in zip(step.tolist(), _LEAST, strict=True)):
+    dx, dy, turn = (after - before).tolist()
+    turn = wrap_angle(turn)
+    if abs(dx) <= _LEAST and abs(dy) <= _LEAST and abs(turn) <= _LEAST_TURN:
         return False
+    step = np.array([dx, dy, turn])
     return bool(step @ np.linalg.solve(cov, step) > _LIMIT)

@@ -25,7 +25,6 @@ from estimators.messages import (
     RangeFrame,
     Scan,
 )
-from estimators.models.motion import increment
 from estimators.range_gate import RangeGate
 
 SAME_NS = 1_000_000
@@ -33,6 +32,9 @@ SAME_NS = 1_000_000
 POSE, VELOCITY, REFERENCE, STATE = slice(0, 3), slice(3, 6), slice(6, 9), slice(0, 6)
 _WIDEST = np.array([100.0, 100.0, np.pi, 10.0, 10.0, 10.0])
 """Standard deviations [m, rad, m/s, rad/s] beyond which a window that begins anew knows nothing at all."""
+
+_OF_NODE = {"increments": 1, "ranges": 0, "sightings": 0}
+"""Column of each table for the node of the instant at which a factor was measured."""
 
 _TAKES: frozenset[type[Measurement]] = frozenset(
     {RangeFrame, LandmarkFrame, PoseIncrement, LoopClosure, Scan}
@@ -156,7 +158,7 @@ class GraphSmoother(KeyframeTracker):
 
     def _follow(self, measured: PoseIncrement) -> Report:
         mean, cov = self._predicted(measured.stamp_ns)
-        nis = self._judging.motion_nis(measured, mean[REFERENCE], mean[POSE], cov)
+        nis = self._nis(measured, mean[REFERENCE], mean[POSE], cov)
         passes = nis <= self._increment_gate and self._take_increment(measured)
         return Report((Verdict.ACCEPTED if passes else Verdict.GATED,), np.full(1, np.nan), np.array([nis]))
 
@@ -212,11 +214,11 @@ class GraphSmoother(KeyframeTracker):
             else:
                 # The two poses are taken for independent, which makes the gate wider than need be.
                 (earlier, cov_earlier), (later, cov_later) = map(self._window.state_of, (reference, node))
-                predicted, by_reference, by_pose = increment(earlier[POSE], later[POSE])
-                spread = by_reference @ cov_earlier[POSE, POSE] @ by_reference.T
-                spread += by_pose @ cov_later[POSE, POSE] @ by_pose.T
-                passes = self._judging.increment_nis(measured, predicted, spread) <= self._increment_gate
-                if not (passes and self._take_increment(measured)):
+                cov = np.zeros((9, 9))
+                cov[POSE, POSE] = cov_later[POSE, POSE]
+                cov[REFERENCE, REFERENCE] = cov_earlier[POSE, POSE]
+                nis = self._nis(measured, earlier[POSE], later[POSE], cov)
+                if not (nis <= self._increment_gate and self._take_increment(measured)):
                     verdict = Verdict.GATED
         if measured.is_keyframe:
             self._keep_keyframe(measured.stamp_ns)
@@ -247,10 +249,16 @@ class GraphSmoother(KeyframeTracker):
             return Report((Verdict.GATED,))
         variable = self._window.variable(place)
         at, now = self._window.graph.values[variable], self._window.newest[0]
-        nis = self._judging.motion_nis(measured, at, now, cov)
+        nis = self._nis(measured, at, now, cov)
         rows = factors.increments(variable, -1, measured.increment, measured.cov)
         passes = nis <= self._increment_gate and self._take(measured.stamp_ns, "increments", rows)
         return Report((Verdict.ACCEPTED if passes else Verdict.GATED,), np.full(1, np.nan), np.array([nis]))
+
+    def _nis(
+        self, measured: PoseIncrement | LoopClosure, reference: FloatArray, pose: FloatArray, cov: FloatArray
+    ) -> float:
+        """NIS of a motion between two poses; covariance (9, 9) of the second, its velocity and the first."""
+        return self._motion.increment_nis(reference, pose, cov, measured.increment, measured.cov)
 
     def _take_increment(self, measured: PoseIncrement) -> bool:
         node = self._node_of(measured.stamp_ns)
@@ -261,10 +269,10 @@ class GraphSmoother(KeyframeTracker):
         return self._take(measured.stamp_ns, "increments", rows)
 
     def _take(self, stamp_ns: int, table: str, rows: FloatArray) -> bool:
-        """Add factors on the node of an instant, which has the number -1 in them, and solve."""
+        """Add factors on the node of an instant, whose number is not in them yet, and solve."""
         node = self._node_of(stamp_ns)
         assert node is not None
-        rows[:, :2] = np.where(rows[:, :2] < 0, self._window.variable(node), rows[:, :2])
+        rows[:, _OF_NODE[table]] = self._window.variable(node)
         self._window.add(**{table: rows})
         return self._solve()
 
@@ -327,7 +335,7 @@ class GraphSmoother(KeyframeTracker):
         self._mean, self._cov = self._predicted(stamp_ns)
         node = window.insert(stamp_ns, self._guess(stamp_ns))
         ends = window.variable(node - 1), window.variable(node)
-        window.add(motions=factors.motions(*ends, (stamp_ns - newest_ns) * 1e-9, *self._accel_noise))
+        window.add(motions=factors.motion(*ends, (stamp_ns - newest_ns) * 1e-9, *self._accel_noise))
         return node
 
     def _guess(self, stamp_ns: int) -> FloatArray:  # noqa: ARG002

@@ -10,12 +10,23 @@ from math import sqrt
 
 import numpy as np
 
-from estimators.kernels.compilation import INDICES, MATRIX, compiled
+from estimators.kernels.compilation import INDICES, MATRIX, compiled, inlined
 from estimators.messages import FloatArray, IntArray
 
 BLOCKS = "float64[:, :, ::1]"
 _LEAST_PIVOT = 1e-12
 """Share of a diagonal element that elimination must leave; less is rounding, and the matrix singular."""
+
+
+@inlined
+def _sort(numbers: IntArray, begin: int, end: int) -> None:
+    """Sort a few numbers in place, where a call of a library would take longer than it works."""
+    for k in range(begin + 1, end):
+        number, place = numbers[k], k
+        while place > begin and numbers[place - 1] > number:
+            numbers[place] = numbers[place - 1]
+            place -= 1
+        numbers[place] = number
 
 
 @compiled(f"Tuple(({INDICES}, {INDICES}))(int64, int64[:, ::1])")
@@ -70,7 +81,7 @@ def pattern(count: int, pairs: IntArray) -> tuple[IntArray, IntArray]:
                     rows[end] = rows[k]
                     end += 1
             child = next_sibling[child]
-        rows[starts[j] : end].sort()
+        _sort(rows, starts[j], end)
         starts[j + 1] = end
         if end > starts[j]:
             parent = rows[starts[j]]
@@ -92,12 +103,14 @@ def place_of(starts: IntArray, rows: IntArray, column: int, row: int) -> int:
     return low
 
 
-@compiled(f"void({MATRIX}, {MATRIX}, {MATRIX})")
-def _subtract_product(C: FloatArray, A: FloatArray, B: FloatArray) -> None:
-    """C -= A B^T."""
+@inlined
+def _subtract_product(C: FloatArray, c: int, A: FloatArray, a: int, B: tuple[float, ...]) -> None:
+    """``C[c] -= A[a] B^T`` with the nine numbers of B, row by row."""
     for i in range(3):
-        for k in range(3):
-            C[i, k] -= A[i, 0] * B[k, 0] + A[i, 1] * B[k, 1] + A[i, 2] * B[k, 2]
+        x, y, z = A[a, i, 0], A[a, i, 1], A[a, i, 2]
+        C[c, i, 0] -= x * B[0] + y * B[1] + z * B[2]
+        C[c, i, 1] -= x * B[3] + y * B[4] + z * B[5]
+        C[c, i, 2] -= x * B[6] + y * B[7] + z * B[8]
 
 
 @compiled(f"int64({INDICES}, {INDICES}, {BLOCKS}, {BLOCKS}, int64)")
@@ -140,19 +153,25 @@ def factorise(
             L[i, i] = sqrt(rest)
         begin, end = starts[j], starts[j + 1]
         a, b, c = 1.0 / L[0, 0], 1.0 / L[1, 1], 1.0 / L[2, 2]
+        l_10, l_20, l_21 = L[1, 0], L[2, 0], L[2, 1]
         for p in range(begin, end):
-            B = below[p]
             for i in range(3):
-                B[i, 0] *= a
-                B[i, 1] = (B[i, 1] - L[1, 0] * B[i, 0]) * b
-                B[i, 2] = (B[i, 2] - L[2, 0] * B[i, 0] - L[2, 1] * B[i, 1]) * c
+                x = below[p, i, 0] * a
+                y = (below[p, i, 1] - l_10 * x) * b
+                below[p, i, 0], below[p, i, 1] = x, y
+                below[p, i, 2] = (below[p, i, 2] - l_20 * x - l_21 * y) * c
         for p in range(begin, end):
-            _subtract_product(diagonal[rows[p]], below[p], below[p])
+            B = (
+                *(below[p, 0, 0], below[p, 0, 1], below[p, 0, 2]),
+                *(below[p, 1, 0], below[p, 1, 1], below[p, 1, 2]),
+                *(below[p, 2, 0], below[p, 2, 1], below[p, 2, 2]),
+            )
+            _subtract_product(diagonal, rows[p], below, p, B)
             target = starts[rows[p]]
             for q in range(p + 1, end):
                 while rows[target] < rows[q]:
                     target += 1
-                _subtract_product(below[target], below[q], below[p])
+                _subtract_product(below, target, below, q, B)
     return -1
 
 

@@ -348,8 +348,12 @@ def linearise(
         row = motions[k]
         dt = row[4]
         of_place, mixed, of_speed = 12.0 / dt**3, -6.0 / dt**2, 4.0 / dt
-        # Rows: position, velocity. Columns: earlier position and velocity, later position and velocity.
-        by = ((-1.0, 0.0), (-dt, -1.0), (1.0, 0.0), (0.0, 1.0))
+        # Of earlier position and velocity, later position and velocity: lower half, row by row.
+        weights = (
+            *(of_place, -mixed, of_speed),
+            *(-of_place, mixed, of_place),
+            *(-mixed, 0.5 * of_speed, mixed, of_speed),
+        )
         for axis in range(3):
             density = row[5] if axis < 2 else row[6]
             w = 1.0 / (density * density)
@@ -361,18 +365,17 @@ def linearise(
             )
             cost += 0.5 * (place * pull_place + speed * pull_speed)
             if with_system and free[int(row[0]), axis] != 0.0:
+                pulls = (-pull_place, -dt * pull_place - pull_speed, pull_place, pull_speed)
                 n = 0
                 for a in range(4):
-                    i = order[int(row[a])]
-                    left_place = w * (by[a][0] * of_place + by[a][1] * mixed)
-                    left_speed = w * (by[a][0] * mixed + by[a][1] * of_speed)
-                    if i >= 0:
-                        gradient[i, axis] += by[a][0] * pull_place + by[a][1] * pull_speed
-                        diagonal[i, axis, axis] += left_place * by[a][0] + left_speed * by[a][1]
-                    for b in range(a):
+                    for _ in range(a):
                         if slots_m[k, n] >= 0:
-                            below[slots_m[k, n], axis, axis] += left_place * by[b][0] + left_speed * by[b][1]
+                            below[slots_m[k, n], axis, axis] += w * weights[n + a]
                         n += 1
+                    i = order[int(row[a])]
+                    if i >= 0:
+                        gradient[i, axis] += pulls[a]
+                        diagonal[i, axis, axis] += w * weights[n + a]
 
     for k in range(len(priors)):
         row = priors[k]

@@ -155,3 +155,32 @@ def predicted(
         moved[3 + i, i] += power * step * dt / 2.0
         moved[3 + i, 3 + i] += power * step
     return mean, 0.5 * (moved + moved.T)
+
+
+@compiled(f"float64({VECTOR}, {VECTOR}, {MATRIX}, {VECTOR}, {MATRIX})")
+def increment_nis(
+    reference: FloatArray, pose: FloatArray, cov: FloatArray, increment: FloatArray, increment_cov: FloatArray
+) -> float:
+    """Normalised innovation squared of an increment between two poses.
+
+    Args:
+        reference: (3,) pose where it begins, map frame.
+        pose: (3,) pose where it ends, map frame.
+        cov: (9, 9) of this pose, its velocity and the reference.
+        increment: (3,) measured, in the body frame of the reference.
+        increment_cov: (3, 3) of the same.
+
+    Source: model: `models.motion.increment`.
+    """
+    c, s = cos(reference[2]), sin(reference[2])
+    dx, dy = pose[0] - reference[0], pose[1] - reference[1]
+    ahead, left = c * dx + s * dy, c * dy - s * dx
+    by_pose = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+    H = np.zeros((3, 9))
+    H[:, :3], H[:, 6:] = by_pose, -by_pose
+    H[0, 8], H[1, 8] = left, -ahead
+    turn = wrapped(increment[2] - wrapped(pose[2] - reference[2]))
+    residual = np.array([increment[0] - ahead, increment[1] - left, turn])
+    root = cholesky(H @ cov @ H.T + increment_cov)
+    scaled = solve_lower(root, residual)
+    return float(scaled[0] ** 2 + scaled[1] ** 2 + scaled[2] ** 2)

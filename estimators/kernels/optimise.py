@@ -4,15 +4,7 @@ import numpy as np
 
 from estimators.kernels.block_cholesky import BLOCKS, factorise, solve_down, solve_up
 from estimators.kernels.compilation import INDICES, MATRIX, VECTOR, compiled
-from estimators.kernels.factors import (
-    GRAPH,
-    SYSTEM,
-    GraphArrays,
-    System,
-    last_use,
-    linearise,
-    system_of,
-)
+from estimators.kernels.factors import GRAPH, SYSTEM, GraphArrays, System, linearise
 from estimators.messages import FloatArray, IntArray
 
 _DECREMENT = 1e-7
@@ -153,67 +145,3 @@ def marginalise(
                 for b in range(3):
                     information[to + a, at + b] = information[at + b, to + a] = below[p, a, b]
     return undetermined, information, pull
-
-
-@compiled(f"{MATRIX}({INDICES}, {INDICES}, {BLOCKS}, {BLOCKS}, int64)")
-def _last_root(
-    starts: IntArray, rows: IntArray, diagonal: FloatArray, below: FloatArray, blocks: int
-) -> FloatArray:
-    """The factor (3 K, 3 K) of the last K variables in elimination order."""
-    first = len(starts) - 1 - blocks
-    root = np.zeros((3 * blocks, 3 * blocks))
-    for k in range(blocks):
-        root[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] = diagonal[first + k]
-        for p in range(starts[first + k], starts[first + k + 1]):
-            m = rows[p] - first
-            root[3 * m : 3 * m + 3, 3 * k : 3 * k + 3] = below[p]
-    return root
-
-
-@compiled(f"Tuple((int64, {MATRIX}, {MATRIX}))({MATRIX}, {GRAPH}, {INDICES}, int64, int64, int64, float64)")
-def solve_window(
-    values: FloatArray,
-    graph: GraphArrays,
-    asked: IntArray,
-    known: int,
-    first: int,
-    iterations: int,
-    tolerance: float,
-) -> tuple[int, FloatArray, FloatArray]:
-    """Move the values of a window of nodes to their optimum, in place, and tell what is known of some.
-
-    Args:
-        values: (V, 3).
-        graph: factors.
-        asked: (K,) variables whose covariance is asked for.
-        known: so many variables, the first, are known.
-        first: of those before this one only the variables of the dense prior are solved for.
-        iterations: as in `gauss_newton`.
-        tolerance: likewise.
-
-    Returns:
-        As `gauss_newton` a status, which is `OUT_OF_REACH` where a factor is on a variable that is not solved
-        for; covariance (3 K, 3 K) of the variables asked for; its inverse.
-    """
-    nothing = np.empty((0, 0))
-    dense = graph[6]
-    last_needed = last_use(graph)
-    # What is asked for goes last: its covariance is then read off the end of the factor.
-    for k in range(len(asked)):
-        last_needed[asked[k]] = len(values) + k
-    solved_for = np.zeros(len(values), dtype=np.bool_)
-    solved_for[first:] = True
-    solved_for[dense] = True
-    for i in range(known, first):
-        if last_needed[i] >= 0 and not solved_for[i]:
-            return OUT_OF_REACH, nothing, nothing
-    variables = np.flatnonzero(solved_for)
-    order = np.full(len(values), -1, dtype=np.int64)
-    order[variables[np.argsort(last_needed[variables], kind="mergesort")]] = np.arange(len(variables))
-    system = system_of(graph, order, len(variables))
-    status, _, _, diagonal, below = gauss_newton(values, graph, system, iterations, tolerance)
-    if status not in (CONVERGED, NOT_CONVERGED) or not np.isfinite(values).all():
-        return (NOT_FINITE if status < 0 else status), nothing, nothing
-    root = _last_root(system[1], system[2], diagonal, below, len(asked))
-    inverse = np.linalg.inv(root)
-    return status, inverse.T @ inverse, root @ root.T

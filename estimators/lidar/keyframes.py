@@ -1,7 +1,7 @@
 """Odometry increments from a known start, in stamp order: what every estimator on them does alike."""
 
 from abc import ABC, abstractmethod
-from math import inf
+from math import isfinite
 
 import numpy as np
 from pydantic import Field
@@ -171,9 +171,12 @@ class KeyframeTracker(ABC):
 
 
 def is_covariance(cov: FloatArray) -> bool:
-    """Whether a symmetric matrix (3, 3) is finite and positive definite, as its leading minors tell."""
-    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = cov.tolist()
-    minor = xx * yy - xy * yx
-    whole = xx * (yy * zz - yz * zy) - xy * (yx * zz - yz * zx) + xz * (yx * zy - yy * zx)
-    # All nine numbers are in the last: one that is not finite leaves it so.
-    return bool(xx > 0.0 and minor > 0.0 and 0.0 < whole < inf)
+    """Whether a matrix (3, 3) is finite and positive definite: its pivots are positive."""
+    numbers = cov.ravel().tolist()
+    if not all(map(isfinite, numbers)):
+        return False
+    xx, _, _, xy, yy, _, xz, yz, zz = numbers
+    if xx <= 0.0:
+        return False
+    second = yy - xy * xy / xx
+    return second > 0.0 and zz - xz * xz / xx - (yz - xy * xz / xx) ** 2 / second > 0.0

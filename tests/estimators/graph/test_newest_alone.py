@@ -191,3 +191,17 @@ def test_what_comes_late_between_the_newest_nodes_is_taken_as_by_a_window_solved
         states.append((window.newest.copy(), cov))
     np.testing.assert_allclose(states[0][0], states[1][0], atol=1e-4)
     np.testing.assert_allclose(states[0][1], states[1][1], rtol=1e-3, atol=1e-6)
+
+
+def test_all_is_solved_anew_when_the_newest_nodes_draw_old_ones_far_away() -> None:
+    window = Watched(KNOWN, 2)
+    state = np.array([[5.0, 4.0, 0.3], [0.0, 0.0, 0.0]])
+    window.begin(0, state, np.diag([0.3, 0.3, 0.1, 0.01, 0.01, 0.01]) ** 2)
+    window.update()
+    for k, (shift, solved) in enumerate([(0.0, 1), (0.5, 2)], start=1):
+        node = window.insert(k * 10**8, state)
+        window.add(motions=factors.motion(window.variable(node - 1), window.variable(node), 0.1, 0.5, 1.5))
+        distances = np.hypot(*(ANCHORS - state[0, :2] - [shift, 0.0]).T)
+        window.add(ranges=factors.ranges(window.variable(node), np.arange(len(ANCHORS)), distances, 0.1))
+        window.update()
+        assert window.solved == solved

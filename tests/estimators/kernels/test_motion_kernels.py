@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
+from estimators.geometry import wrap_angle
 from estimators.kernels import cloud, motion
 from estimators.messages import FloatArray
-from estimators.models.motion import constant_velocity
+from estimators.models.motion import constant_velocity, increment
 from tests.estimators.kernels.clouds import deviations, law, random_cloud, wrapped
 
 SEEDS = pytest.mark.parametrize("seed", range(3))
@@ -97,3 +98,18 @@ def test_a_state_is_predicted_as_by_the_model(seed: int, dt: float, size: int) -
     np.testing.assert_allclose(cov, F @ before @ F.T + Q, rtol=1e-12, atol=1e-12)
     np.testing.assert_array_equal(cov, cov.T)
     np.testing.assert_array_equal(before, factor @ factor.T)
+
+
+@SEEDS
+def test_nis_of_an_increment_is_that_of_its_model(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    reference, pose = rng.uniform(-3.0, 3.0, size=(2, 3))
+    root = rng.normal(size=(9, 9))
+    cov = root @ root.T
+    predicted, by_reference, by_pose = increment(reference, pose)
+    measured = predicted + np.array([0.3, -0.2, 6.0])
+    H = np.hstack([by_pose, np.zeros((3, 3)), by_reference])
+    residual = measured - predicted
+    residual[2] = wrap_angle(residual[2])
+    expected = residual @ np.linalg.solve(H @ cov @ H.T + COV, residual)
+    assert motion.increment_nis(reference, pose, cov, measured, COV) == pytest.approx(expected, rel=1e-9)
