@@ -187,11 +187,8 @@ class Chain:
         self._start_ns = start_ns
         self._period_ns = 1e9 / config.pipeline.rate
         self._ticks = 0
-
-    @property
-    def next_tick_ns(self) -> int:
+        self.next_tick_ns = start_ns
         """When the next pose is due."""
-        return self._start_ns + round(self._ticks * self._period_ns)
 
     def anchors(self, now_ns: int) -> list[AnchorState]:
         """What became lately of each anchor's ranges, by the primary estimator."""
@@ -203,7 +200,10 @@ class Chain:
         On a busy machine bytes may wait for longer than `pipeline.hold_ms`. A replay of the log must not have
         them any earlier.
         """
-        return max(arrival_ns, self._start_ns + round((self._ticks - 1) * self._period_ns))
+        return max(arrival_ns, self._tick_ns(self._ticks - 1))
+
+    def _tick_ns(self, number: int) -> int:
+        return self._start_ns + round(number * self._period_ns)
 
     def feed(self, chunk: RawChunk) -> Iterator[Tick]:
         """Give the ticks that were due before these bytes arrived, then decode the bytes.
@@ -213,7 +213,8 @@ class Chain:
         """
         if chunk.direction is Direction.OUT:
             return
-        yield from self.advance(chunk.stamp_ns)
+        if chunk.stamp_ns >= self.next_tick_ns:
+            yield from self.advance(chunk.stamp_ns)
         decoder = self._decoders.get(chunk.source)
         if decoder is not None:
             for measurement in decoder.feed(chunk.data, chunk.stamp_ns):
@@ -231,6 +232,7 @@ class Chain:
         while self.next_tick_ns <= now_ns:
             yield self._tick(self.next_tick_ns)
             self._ticks += 1
+            self.next_tick_ns = self._tick_ns(self._ticks)
 
     def _tick(self, stamp_ns: int) -> Tick:
         outcomes: list[Outcome] = []

@@ -84,8 +84,12 @@ class ScanPreparation:
         self._attitude: Attitude | None = None
 
     def observe(self, measurement: Measurement) -> None:
-        """Remember the newest attitude; other measurements and bad ones say nothing."""
-        if isinstance(measurement, Attitude) and abs(np.linalg.norm(measurement.quat_wxyz) - 1.0) < 0.01:
+        """Remember the newest attitude, if scans are levelled by it; bad ones say nothing."""
+        if (
+            self._config.level
+            and isinstance(measurement, Attitude)
+            and abs(np.linalg.norm(measurement.quat_wxyz) - 1.0) < 0.01
+        ):
             self._attitude = measurement
 
     def prepare(self, scan: Scan) -> PreparedScan:
@@ -101,7 +105,7 @@ class ScanPreparation:
             config.max_points,
             config.spacing,
         )
-        if config.level and self._attitude is not None:
+        if self._attitude is not None:
             age = abs(stamp_ns - self._attitude.stamp_ns) * 1e-9
             if age <= MOST_ATTITUDE_AGE:
                 level = points @ _tilt(self._attitude.quat_wxyz)[:, :2].T
