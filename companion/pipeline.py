@@ -115,6 +115,9 @@ class Pipeline:
         self._estimators = dict(estimators)
         self._look_back = look_back
         self._takes = {name: taken_by(estimator) for name, estimator in self._estimators.items()}
+        # Whether a protocol is kept takes longer to find out than most of what is then called.
+        self._sketched = {name: e for name, e in self._estimators.items() if isinstance(e, Sketched)}
+        self._landmarked = front_end if isinstance(front_end, Landmarked) else None
         self._unused = dict.fromkeys(self._estimators, Report((Verdict.NOT_USED,)))
         # Most of what arrives are inertial samples, and most estimators have no use for them.
         self._takers: dict[type[Measurement], list[str]] = {}
@@ -143,12 +146,12 @@ class Pipeline:
 
     def sketches(self) -> dict[str, Sketch]:
         """What estimators hold besides their poses, of those that can show it."""
-        shown = {name: e.sketch() for name, e in self._estimators.items() if isinstance(e, Sketched)}
+        shown = {name: estimator.sketch() for name, estimator in self._sketched.items()}
         return {name: sketch for name, sketch in shown.items() if sketch is not None}
 
     def landmarks(self) -> FloatArray:
         """(N, 2) [m] of the front end, in the body frame at the end of the newest scan."""
-        return self._front_end.landmarks if isinstance(self._front_end, Landmarked) else _NO_LANDMARKS
+        return _NO_LANDMARKS if self._landmarked is None else self._landmarked.landmarks
 
     def _update(self, measurement: Measurement) -> Outcome:
         kind = type(measurement)

@@ -48,6 +48,7 @@ class _TimedEstimator:
 
     def __init__(self, estimator: Estimator, stopwatch: Stopwatch) -> None:
         self._estimator = estimator
+        self._sketched = estimator if isinstance(estimator, Sketched) else None
         self._stopwatch = stopwatch
 
     def reset(self) -> None:
@@ -68,7 +69,7 @@ class _TimedEstimator:
         return self._estimator.pose_at(stamp_ns)
 
     def sketch(self) -> Sketch | None:
-        return self._estimator.sketch() if isinstance(self._estimator, Sketched) else None
+        return None if self._sketched is None else self._sketched.sketch()
 
 
 class _TimedFrontEnd:
@@ -76,6 +77,7 @@ class _TimedFrontEnd:
 
     def __init__(self, front_end: FrontEnd, stopwatch: Stopwatch) -> None:
         self._front_end = front_end
+        self._landmarked = front_end if isinstance(front_end, Landmarked) else None
         self._stopwatch = stopwatch
 
     def update(self, measurement: Measurement) -> PoseIncrement | None:
@@ -89,7 +91,7 @@ class _TimedFrontEnd:
     @property
     def landmarks(self) -> FloatArray:
         """Of the front end, if it has any."""
-        return self._front_end.landmarks if isinstance(self._front_end, Landmarked) else np.empty((0, 2))
+        return np.empty((0, 2)) if self._landmarked is None else self._landmarked.landmarks
 
 
 @dataclass(slots=True)
