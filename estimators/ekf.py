@@ -36,22 +36,19 @@ class Ekf(FixTaker, LidarOdometry):
         self._gate.reset()
 
     def _update_ranges(self, frame: RangeFrame) -> Report:
-        residuals, nis = np.full((2, len(frame.ranges)), np.nan)
-        candidates = self._gate.horizontal.of(frame, self._filter.x[POSE], float(self._filter.P[2, 2]))
-        verdicts, arm = candidates.verdicts, self._setup.arm(frame.tag_id)
-        for i, (x, y, measured, sigma) in enumerate(candidates.rows.tolist()):
-            if verdicts[i] is not Verdict.WAITING:
-                continue
-            predicted, by_pose = horizontal_range(self._filter.x[POSE], (x, y), arm)
-            H = np.zeros((1, 9))
-            H[0, POSE] = by_pose + candidates.bias_by_pose[i]
-            variance = float((H @ self._filter.P @ H.T).item()) + sigma**2
-            residuals[i] = measured - predicted
-            nis[i] = residuals[i] ** 2 / variance
-            verdicts[i], factor = self._gate.judge(candidates, i, residuals[i], nis[i])
-            if verdicts[i].is_used:
-                self._correct(residuals[i : i + 1], H, np.array([[(factor * sigma) ** 2]]))
-        return Report(tuple(verdicts), residuals, nis)
+        pose, arm = self._filter.x[POSE], self._setup.arm(frame.tag_id)
+        candidates = self._gate.horizontal.of(frame, pose, float(self._filter.P[2, 2]))
+        residuals, H = np.zeros(len(frame.ranges)), np.zeros((len(frame.ranges), 9))
+        for i, (x, y, measured, _) in enumerate(candidates.rows.tolist()):
+            if candidates.verdicts[i] is Verdict.WAITING:
+                predicted, by_pose = horizontal_range(pose, (x, y), arm)
+                residuals[i], H[i, POSE] = measured - predicted, by_pose + candidates.bias_by_pose[i]
+        report = self._gate.judge_together(candidates, residuals.copy(), H @ self._filter.P @ H.T)
+        sigmas = candidates.rows[:, 3]
+        used = np.isfinite(sigmas)
+        if used.any():
+            self._correct(residuals[used], H[used], np.diag(sigmas[used] ** 2))
+        return report
 
     def _update_landmarks(self, frame: LandmarkFrame) -> Verdict:
         landmarks = self._landmark_gate.usable(frame)
