@@ -6,6 +6,7 @@ shift of one anchor must explain these, in every bin.
 """
 
 from dataclasses import dataclass
+from math import hypot, isfinite
 
 import numpy as np
 
@@ -73,17 +74,17 @@ class RangeMisses:
         self._bins: list[_Bin] = []
         self._begin_ns: int | None = None
         self._residuals: dict[int, list[float]] = {}
-        self._directions: dict[int, FloatArray] = {}
+        self._directions: dict[int, tuple[float, float]] = {}
 
-    def add(self, stamp_ns: int, anchor_id: int, residual: float, anchor_to_tag: FloatArray) -> None:
-        """Take a range with its residual [m] and the vector (2,) [m] from anchor to tag."""
+    def add(self, stamp_ns: int, anchor_id: int, residual: float, dx: float, dy: float) -> None:
+        """Take a range with its residual [m] and the vector [m] from anchor to tag."""
         if self._begin_ns is None or stamp_ns - self._begin_ns >= BIN_NS:
             self._close_bin()
             self._begin_ns = stamp_ns
-        distance = float(np.hypot(*anchor_to_tag))
-        if np.isfinite(residual) and distance > 0.0:
+        distance = hypot(dx, dy)
+        if isfinite(residual) and distance > 0.0:
             self._residuals.setdefault(anchor_id, []).append(residual)
-            self._directions[anchor_id] = anchor_to_tag / distance
+            self._directions[anchor_id] = dx / distance, dy / distance
 
     def shift(self) -> Shift | None:
         """The shift of one anchor that explains the misses from some time on; None where none does."""

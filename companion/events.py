@@ -1,6 +1,7 @@
 """What happened in a run, with its time and its likely cause: found from the ticks, as they come."""
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -133,7 +134,7 @@ class EventFinder:
             for k, i in enumerate(frame.anchor_ids[: len(report.verdicts)].tolist())
             if i in self._config.anchors and report.verdicts[k] is not Verdict.NOT_USED
         ]
-        tag = None if pose is None else _tag(pose, np.array(self._config.body.tag[:2]))
+        tag = None if pose is None else _tag(pose, self._config.body.tag[:2]).tolist()
         refused = 0
         for k, i, verdict in known:
             self._take_sign(f"A{i}", frame.stamp_ns)
@@ -150,8 +151,8 @@ class EventFinder:
                 self._blocked[i].seen += 1
                 self._blocked[i].refused += is_refused
             if tag is not None:
-                anchor = np.array(self._config.anchors[i][:2])
-                self._misses.add(frame.stamp_ns, i, residual, tag - anchor)
+                x, y, _ = self._config.anchors[i]
+                self._misses.add(frame.stamp_ns, i, residual, tag[0] - x, tag[1] - y)
         self._take_contradiction(frame.stamp_ns, refused, len(known))
 
     def _take_contradiction(self, stamp_ns: int, refused: int, known: int) -> None:
@@ -255,9 +256,9 @@ def worst_error(errors: Errors, begin_ns: int) -> Event | None:
     )
 
 
-def _tag(pose: PoseEstimate, tag_in_body: FloatArray) -> FloatArray:
+def _tag(pose: PoseEstimate, tag_in_body: Sequence[float]) -> FloatArray:
     """The tag, (2,) [m], map frame; where the heading is not known its lever arm is left out."""
     if not np.isfinite(pose.cov[5, 5]):
         return pose.xy
-    tag: FloatArray = transform(np.array([*pose.xy, pose.yaw]), tag_in_body[None])[0]
+    tag: FloatArray = transform(np.array([*pose.xy, pose.yaw]), np.array([tag_in_body]))[0]
     return tag

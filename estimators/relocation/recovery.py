@@ -90,6 +90,7 @@ class Recovering:
 
     def __init__(self, wrapped: Settable, config: Config, range_sigma: float, setup: Setup) -> None:
         self._wrapped = wrapped
+        self._sketched = wrapped if isinstance(wrapped, Sketched) else None
         self._config = config
         self._period_ns = round(config.period * 1e9)
         self._starts_known = setup.start.known
@@ -139,7 +140,7 @@ class Recovering:
 
     def sketch(self) -> Sketch | None:
         """What the filter shows; nothing before the start is known."""
-        return self._wrapped.sketch() if self._known and isinstance(self._wrapped, Sketched) else None
+        return None if self._sketched is None or not self._known else self._sketched.sketch()
 
     def _look_round(self, now_ns: int) -> None:
         """Search when it is time for it, and there is reason to."""

@@ -120,7 +120,7 @@ def misses(
         for i, corner in enumerate(corners):
             u = (tag - corner) / np.linalg.norm(tag - corner)
             noisy = residual(i, u, k) - float(u @ error) + rng.normal(0.0, 0.05)
-            found.add(k * 100_000_000, i, noisy, tag - corner)
+            found.add(k * 100_000_000, i, noisy, *(tag - corner).tolist())
     return found
 
 
