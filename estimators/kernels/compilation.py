@@ -13,17 +13,15 @@ from numba import njit
 Function = TypeVar("Function", bound=Callable[..., object])
 
 MATRIX, VECTOR, INDICES = "float64[:, ::1]", "float64[::1]", "int64[::1]"
-
-
 KERNELS = re.compile(r"^from (\w+\.kernels\.\w+) import", re.MULTILINE)
 """What a module of kernels says of the others that it calls."""
 
 
 @cache
-def _sources(module: str) -> frozenset[str]:
-    """Source of a loaded module of kernels, and of those that it calls."""
+def sources_of(module: str) -> frozenset[str]:
+    """Source texts of a loaded module of kernels and of those that it calls."""
     source = Path(str(sys.modules[module].__file__)).read_text()
-    return frozenset({source}).union(*map(_sources, KERNELS.findall(source)))
+    return frozenset({source}).union(*map(sources_of, KERNELS.findall(source)))
 
 
 def compiled(signature: str) -> Callable[[Function], Function]:
@@ -34,7 +32,7 @@ def compiled(signature: str) -> Callable[[Function], Function]:
     """
 
     def compile_or_load(function: Function) -> Function:
-        sources = "".join(sorted(_sources(function.__module__)))
+        sources = "".join(sorted(sources_of(function.__module__)))
         function.__qualname__ += f"_{sha256(sources.encode()).hexdigest()[:8]}"
         return cast("Function", njit(signature, cache=True, error_model="numpy")(function))
 

@@ -17,6 +17,7 @@ from estimators.kernels import (
     scan_fit,
     scan_lines,
 )
+from estimators.kernels.compilation import sources_of
 
 MODULES = (
     anchor_trust,
@@ -60,3 +61,15 @@ def test_a_second_process_compiles_nothing() -> None:
     subprocess.run(
         [sys.executable, "-c", code], check=True, cwd=root, env={**os.environ, "PYTHONPATH": str(root)}
     )
+
+
+def test_a_kernel_is_compiled_anew_when_one_that_it_calls_has_changed_and_only_then() -> None:
+    loaded = {name: module for name, module in sys.modules.items() if name.startswith("estimators.kernels.")}
+    calls = 0
+    for name, module in loaded.items():
+        known = sources_of(name)
+        for other in {str(getattr(f, "__module__", "")) for f in vars(module).values()} & loaded.keys():
+            calls += other != name
+            assert Path(str(loaded[other].__file__)).read_text() in known
+    assert calls > 10
+    assert Path(str(likelihood.__file__)).read_text() not in sources_of(scan_fit.__name__)
