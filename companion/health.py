@@ -258,7 +258,7 @@ class HealthMonitor:
             return Health(State.LOST, f"heading not known: {what}", self._note or "heading not known")
         if not (np.isfinite(pose.T_map_body).all() and np.isfinite(cov).all()):
             return Health(State.LOST, "pose or covariance is not finite")
-        if not _is_positive_definite(cov):
+        if np.linalg.eigvalsh(cov)[0] <= 0.0:
             return Health(State.LOST, "covariance is not positive definite")
         sigma_xy = _widest(pose.cov[:2, :2])
         if sigma_xy > table.max_sigma_xy:
@@ -320,14 +320,6 @@ class HealthMonitor:
         if self._has_scans:
             sources.append(source("LiDAR increment", self._increment_ns, table.max_increment_age))
         return sources
-
-
-def _is_positive_definite(cov: FloatArray) -> bool:
-    try:
-        np.linalg.cholesky(cov)
-    except np.linalg.LinAlgError:
-        return False
-    return True
 
 
 def _widest(cov: FloatArray) -> float:
