@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from companion.evaluation import Evaluation
 
-_TABLE_WIDTH = 100
+_TABLE_WIDTH = 160
 """Of what goes to a file, where there is no terminal to fit into."""
 
 app = typer.Typer(help="Measure how good the algorithms are.", no_args_is_help=True, rich_markup_mode="rich")

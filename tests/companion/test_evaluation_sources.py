@@ -16,6 +16,7 @@ from companion.evaluation_plots import evaluation_figure
 from companion.evaluation_table import markdown
 from companion.fault_table import fault_markdown
 from companion.log import Log, LogWriter, RawChunk
+from companion.log_edit import faults
 from companion.replay import config_of, replay
 from companion.trial_runner import run_trials
 from companion.worst_trial import write_worst_trial
@@ -224,7 +225,7 @@ def test_all_faults_of_the_library_come_in_one_table_after_the_trials_without(
     short_log: Path, tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     names = ["drop:anchor=1,at=1", "gone:at=2,for=1"]
-    monkeypatch.setattr("companion.log_edit.faults.library", lambda _: names)
+    monkeypatch.setattr(faults, "library", lambda _: names)
     done = command(
         *("evaluate", short_log, "--trials", "1", "--workers", "1", "--estimators", "ekf"),
         *("--fault", "library", "--out", tmp_path / "o", "--json", tmp_path / "f.json"),
