@@ -146,7 +146,6 @@ def reversed_array(array: Any) -> Any:
         ("rplidar", Rplidar, Scan, "beam_times", np.zeros_like),
         ("rplidar", Rplidar, Scan, "angles", lambda angles: angles + np.pi),
         ("rplidar", Rplidar, Scan, "ranges", lambda ranges: -ranges),
-        ("rplidar", Rplidar, Scan, "ranges", lambda ranges: ranges[1:]),
         ("rplidar", Rplidar, Scan, "quality", lambda quality: quality * np.nan),
         ("linktrack", LinkTrack, RangeFrame, "ranges", lambda ranges: ranges - 5),
         ("linktrack", LinkTrack, RangeFrame, "ranges", lambda ranges: ranges * np.inf),
