@@ -106,6 +106,7 @@ def scenario(
         raise UserError(f"cannot write {json_file}: there is no folder {json_file.parent}")
     paths = [_imported(named_file(Path(source), "scenarios"), sets or []) for source in sources]
     results: list[Evaluation] = []
+    is_library = fault == ["library"]
     by_fault: dict[str, dict[str, Evaluation]] = {}
     for path, faults in _runs(paths, fault or [], sets or []):
         with progress(err, counts=True) as shown:
@@ -126,20 +127,20 @@ def scenario(
                 )
             )
         result = results[-1]
-        if fault == ["library"]:
+        if is_library:
             by_fault.setdefault(path.stem, {})[" ".join(faults)] = result
         else:
             _print(result, out)
         if folder is not None:
             lines = _write_report(results, by_fault, path, folder, sets or [], faults)
-            if not by_fault:
+            if not is_library:
                 out.print("\n".join(f"  {line}" for line in lines), soft_wrap=True)
         if result.interrupted:
             err.print(f"[yellow]interrupted: {path} has {result.trials} of {count} trials[/]")
             break
     for name, found in by_fault.items():
         out.print(fault_table(name, found))
-    if by_fault and folder is not None:
+    if is_library and folder is not None:
         out.print(f"  report, pictures and worst trials: {folder}", soft_wrap=True)
     if json_file is not None:
         figures = [result.to_json() for result in results]

@@ -1,6 +1,6 @@
 """What faults do to estimators, in one table: a row for each fault, the trials without one first."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 from rich import box
 from rich.table import Table
@@ -23,12 +23,8 @@ def fault_table(name: str, results: Mapping[str, Evaluation]) -> Table:
     table.add_column("fault", no_wrap=True)
     for heading in _headings(results):
         table.add_column(heading, justify="right", no_wrap=True)
-    for fault, result in results.items():
-        cells = (
-            f"[bold red]{_cell(each)}[/]" if _is_bad(each) else _cell(each)
-            for each in result.estimators.values()
-        )
-        table.add_row(fault or "none", *cells)
+    for row in _rows(results, "[bold red]{}[/]"):
+        table.add_row(*row)
     return table
 
 
@@ -37,11 +33,7 @@ def fault_markdown(name: str, results: Mapping[str, Evaluation]) -> str:
     headings = ["fault", *_headings(results)]
     lines = [f"## {_title(name, results)}", "", markdown_line(headings)]
     lines.append(markdown_line(["---", *["---:"] * (len(headings) - 1)]))
-    for fault, result in results.items():
-        cells = (
-            f"**{_cell(each)}**" if _is_bad(each) else _cell(each) for each in result.estimators.values()
-        )
-        lines.append(markdown_line([fault or "none", *cells]))
+    lines += map(markdown_line, _rows(results, "**{}**"))
     return "\n".join([*lines, "", ""])
 
 
@@ -54,12 +46,17 @@ def _headings(results: Mapping[str, Evaluation]) -> list[str]:
     return list(next(iter(results.values())).estimators)
 
 
-def _cell(figures: MeanFigures | None) -> str:
+def _rows(results: Mapping[str, Evaluation], mark: str) -> Iterator[list[str]]:
+    """Fault and cells; those that one would not fly on are put into the mark."""
+    for fault, result in results.items():
+        yield [fault or "none", *(_cell(figures, mark) for figures in result.estimators.values())]
+
+
+def _cell(figures: MeanFigures | None, mark: str) -> str:
     if figures is None:
         return "none"
-    beyond = "-" if figures.integrity is None else f"{100 * figures.integrity:.2f}"
-    return f"{short(figures.rmse_m, 3)} / {beyond}"
-
-
-def _is_bad(figures: MeanFigures | None) -> bool:
-    return figures is not None and figures.integrity is not None and figures.integrity > MOST_BEYOND
+    error = short(figures.rmse_m, 3)
+    if figures.integrity is None:
+        return f"{error} / -"
+    cell = f"{error} / {100 * figures.integrity:.2f}"
+    return mark.format(cell) if figures.integrity > MOST_BEYOND else cell

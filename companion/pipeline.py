@@ -38,7 +38,7 @@ from estimators.messages import (
 )
 from estimators.models.range_bias import without_bias
 
-_NO_LANDMARKS = np.empty((0, 2))
+NO_LANDMARKS = np.empty((0, 2))
 
 
 class FrontEnd(Protocol):
@@ -93,7 +93,7 @@ class Tick:
     poses: dict[str, PoseEstimate | None]
     health: Health
     sketches: dict[str, Sketch] = field(default_factory=dict)
-    landmarks: FloatArray = field(default_factory=lambda: _NO_LANDMARKS)
+    landmarks: FloatArray = field(default_factory=lambda: NO_LANDMARKS)
 
 
 class Pipeline:
@@ -151,7 +151,7 @@ class Pipeline:
 
     def landmarks(self) -> FloatArray:
         """(N, 2) [m] of the front end, in the body frame at the end of the newest scan."""
-        return _NO_LANDMARKS if self._landmarked is None else self._landmarked.landmarks
+        return NO_LANDMARKS if self._landmarked is None else self._landmarked.landmarks
 
     def _update(self, measurement: Measurement) -> Outcome:
         kind = type(measurement)

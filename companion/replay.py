@@ -10,7 +10,6 @@ from math import isinf
 from pathlib import Path
 from statistics import fmean
 
-import numpy as np
 from scipy.spatial.transform import Rotation
 
 from companion import __version__
@@ -18,7 +17,7 @@ from companion.config import Config, config_from_toml
 from companion.errors import UserError
 from companion.evaluate import Accuracy, Errors, Reference, compare
 from companion.log import Log, RawChunk, Truth
-from companion.pipeline import Chain, FrontEnd, Landmarked, Pipeline, Tick, make_parts
+from companion.pipeline import NO_LANDMARKS, Chain, FrontEnd, Landmarked, Pipeline, Tick, make_parts
 from companion.range_log import HEADER, range_lines
 from drivers.framing import DecodeStats
 from estimators.base import Estimator, Report, Sketch, Sketched, Taken, Verdict, taken_by
@@ -91,7 +90,7 @@ class _TimedFrontEnd:
     @property
     def landmarks(self) -> FloatArray:
         """Of the front end, if it has any."""
-        return np.empty((0, 2)) if self._landmarked is None else self._landmarked.landmarks
+        return NO_LANDMARKS if self._landmarked is None else self._landmarked.landmarks
 
 
 @dataclass(slots=True)

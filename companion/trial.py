@@ -37,7 +37,7 @@ from estimators.bounds import (
 )
 from estimators.geometry import transform_each
 from estimators.lidar.dead_reckoning import DeadReckoning
-from estimators.messages import FloatArray, PoseEstimate, RangeFrame
+from estimators.messages import FloatArray, LandmarkFrame, PoseEstimate, RangeFrame
 
 _BOUND_POSES = 300
 """The bound of single frames is taken at about so many poses of the walk."""
@@ -284,11 +284,11 @@ def _bound(scenario: Scenario, setup: Setup, walk: MeasuredWalk) -> float | None
         if k < len(walk.poses):
             information[k] += seen_from(walk.poses[k], pose, seen)
 
-    for frame, unblocked in zip(walk.range_frames, walk.unblocked, strict=True):
-        pose = _true_pose(scenario, frame.stamp_ns)
+    at_frames = _true_poses(scenario, walk.range_frames)
+    for frame, unblocked, pose in zip(walk.range_frames, walk.unblocked, at_frames, strict=True):
         count(frame.stamp_ns, pose, range_information(pose, setup, unblocked, sigma))
-    for look in walk.landmark_frames:
-        pose, ids = _true_pose(scenario, look.stamp_ns), look.landmark_ids.tolist()
+    for look, pose in zip(walk.landmark_frames, _true_poses(scenario, walk.landmark_frames), strict=True):
+        ids = look.landmark_ids.tolist()
         seen = landmark_information(pose, setup, ids, look.range_sigma, look.bearing_sigma)
         count(look.stamp_ns, pose, seen)
     increment_covs = [increment.cov for increment in walk.increments[1:]]
@@ -296,9 +296,10 @@ def _bound(scenario: Scenario, setup: Setup, walk: MeasuredWalk) -> float | None
     return float(np.sqrt((bounds[:, 0, 0] + bounds[:, 1, 1]).mean()))
 
 
-def _true_pose(scenario: Scenario, stamp_ns: int) -> FloatArray:
-    pose: FloatArray = scenario.trajectory.at(np.array([(stamp_ns - START_NS) * 1e-9])).pose[0]
-    return pose
+def _true_poses(scenario: Scenario, frames: Sequence[RangeFrame | LandmarkFrame]) -> FloatArray:
+    """Poses (N, 3) at which something was measured."""
+    times = np.array([(frame.stamp_ns - START_NS) * 1e-9 for frame in frames], dtype=np.float64)
+    return scenario.trajectory.at(times).pose
 
 
 def _epoch_bound(scenario: Scenario, setup: Setup, poses: FloatArray) -> float | None:

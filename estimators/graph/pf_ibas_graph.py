@@ -65,10 +65,8 @@ class PfIbasGraph(GraphSmoother):
         return self._taken(frame.stamp_ns, "ranges", rows, self._said)
 
     def _guess(self, stamp_ns: int) -> FloatArray:
-        state, pose = (
-            super()._guess(stamp_ns),
-            self._filter.mean,
-        )  # of this instant: it has taken what is there
+        # The filter has taken what is there: its mean is of this instant.
+        state, pose = super()._guess(stamp_ns), self._filter.mean
         turn = wrap_angle(float(pose[2] - state[0, 2]))
         state[0] = pose[0], pose[1], state[0, 2] + turn
         return state

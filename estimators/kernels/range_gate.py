@@ -24,6 +24,7 @@ from estimators.kernels.blocked import (
 )
 from estimators.kernels.compilation import INDICES, MATRIX, VECTOR, compiled
 from estimators.messages import FloatArray, IntArray
+from estimators.models.range import MIN_HORIZONTAL_RANGE
 
 State: TypeAlias = tuple[IntArray, FloatArray, FloatArray, IntArray, IntArray]
 Settings: TypeAlias = tuple[float, float, float, float, float, bool, bool, bool]
@@ -48,8 +49,6 @@ VERDICTS = (
 IMPOSSIBLE, UNKNOWN_ANCHOR = -2, -1
 LOOK = -3
 """There is no verdict before somebody has looked along the line of sight."""
-MIN_HORIZONTAL_RANGE = 0.05
-"""As of `models.range`."""
 
 
 @compiled(f"void({INDICES}, {VECTOR}, {INDICES}, {MATRIX}, float64, float64, {INDICES}, {MATRIX})")

@@ -7,7 +7,7 @@ from estimators.kernels.compilation import INDICES, MATRIX, VECTOR, compiled
 from estimators.kernels.scan_lines import IntegerArray
 from estimators.messages import FloatArray
 
-LEAST_INFORMATION = 1e-8
+LEAST_HESSIAN = 1e-8
 """Of the beams on the pose [m^2, rad^2], so that it has an inverse."""
 
 
@@ -107,7 +107,7 @@ def bent(
         deviation: (3, 3) covariance of what the modes are multiples of.
     """
     count = len(modes)
-    hessian, pulls = LEAST_INFORMATION * np.eye(3), np.zeros((3, count, 3))
+    hessian, pulls = LEAST_HESSIAN * np.eye(3), np.zeros((3, count, 3))
     for i in range(len(rows)):
         if index[i] < 0:
             continue

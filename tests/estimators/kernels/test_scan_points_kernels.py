@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
 from estimators.geometry import between, inverse, transform, transform_each, wrap_angles
-from estimators.kernels.scan_motion import LEAST_INFORMATION, bent, prior_on_states
+from estimators.kernels.scan_motion import LEAST_HESSIAN, bent, prior_on_states
 from estimators.kernels.scan_points import ends_of_beams, extent, returns, seen_from_end
 from estimators.lidar.line_map import surface
 from estimators.models.motion import cubic_between, smooth_motion
@@ -115,7 +115,7 @@ def test_a_mode_of_motion_bends_a_scan_by_what_least_squares_makes_of_it(seed: i
     for mode in modes:
         # The distances change by the mode times the derivative; the pose at the end takes up what it can.
         moved = np.linalg.solve(
-            by_end.T @ by_end + LEAST_INFORMATION * np.eye(3), by_end.T @ (mode[kept, None] * rows[kept, 1:4])
+            by_end.T @ by_end + LEAST_HESSIAN * np.eye(3), by_end.T @ (mode[kept, None] * rows[kept, 1:4])
         )
         expected += moved @ deviation @ moved.T
     assert_allclose(bent(modes, shares, rows, index, deviation), expected, rtol=1e-9)
