@@ -5,11 +5,11 @@ time the pose may be wrong by any e: of n anchors' residuals, what no e explains
 shift of one anchor must explain these, in every bin.
 """
 
-from dataclasses import dataclass
 from math import hypot, isfinite
 
 import numpy as np
 
+from estimators.immutable import immutable
 from estimators.messages import FloatArray
 
 BIN_NS = 500_000_000
@@ -32,7 +32,7 @@ _BEGINNINGS = 20
 _ROUNDS = 15
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@immutable
 class Shift:
     """An anchor's place, seen from where the site file has it.
 
@@ -53,7 +53,7 @@ class Shift:
     after: float
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@immutable
 class _Bin:
     """What no pose explains: misses (n,) [m], and for each anchor what a shift of it would change, (n, 2).
 

@@ -1,7 +1,6 @@
 """The whole chain in memory: devices, drivers, estimator, MAVLink, log, replay, comparison with truth."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +16,7 @@ from companion.sim.autopilot import EmulatedAutopilot
 from companion.sim.scenario import Scenario
 from companion.sim.simulate import START_NS, record
 from companion.view.files import RerunFiles
+from estimators.immutable import immutable
 
 ESTIMATORS_COMPARED = ("ekf", "least_squares", "lidar_odometry")
 
@@ -24,7 +24,7 @@ Progress = Callable[[str, float], None]
 """Takes the name of a stage and the share of it that is done."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@immutable
 class Received:
     """What arrived at the emulated autopilot.
 

@@ -7,6 +7,7 @@ import numpy as np
 
 from companion.log import Truth
 from estimators.geometry import wrap_angles
+from estimators.immutable import immutable
 from estimators.messages import FloatArray, PoseEstimate
 
 
@@ -35,7 +36,7 @@ class Accuracy:
     nees_dof: int
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@immutable
 class Errors:
     """Errors of one track at every instant with pose and truth.
 

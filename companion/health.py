@@ -9,6 +9,7 @@ import numpy as np
 
 from companion.config import HealthTable
 from estimators.base import Report, Verdict
+from estimators.immutable import immutable
 from estimators.messages import (
     FloatArray,
     Measurement,
@@ -60,7 +61,7 @@ class Health:
         return self.state in (State.OK, State.DEGRADED)
 
 
-@dataclass(frozen=True, slots=True)
+@immutable
 class _Source:
     """How long ago one kind of measurement was last accepted."""
 

@@ -24,6 +24,7 @@ from mcap.writer import MCAP0_MAGIC, Writer
 
 from companion import __version__
 from companion.errors import UserError
+from estimators.immutable import immutable
 from estimators.messages import FloatArray
 
 _RECORD = struct.Struct("<BQ")
@@ -69,7 +70,7 @@ class RawChunk:
     data: bytes
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@immutable
 class Truth:
     """Where the body really was.
 

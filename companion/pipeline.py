@@ -6,7 +6,7 @@ replay of the log asks for exactly the poses that the live run gave.
 """
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
@@ -24,6 +24,7 @@ from drivers.autopilot import Autopilot
 from drivers.framing import Sensor
 from estimators import make_estimator
 from estimators.base import Estimator, Report, Sketch, Sketched, Verdict, taken_by
+from estimators.immutable import immutable
 from estimators.lidar.front_ends import ScanFrontEnd, make_scan_front_end
 from estimators.lidar.fused_odometry import FusedOdometry
 from estimators.lidar.scan_matching import ScanMatcher
@@ -67,7 +68,7 @@ class Decoder(Protocol):
         ...
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@immutable
 class Outcome:
     """One measurement and what each estimator made of it."""
 
@@ -75,7 +76,7 @@ class Outcome:
     reports: dict[str, Report]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@immutable
 class Tick:
     """All that happened up to one output instant.
 

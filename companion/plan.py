@@ -12,6 +12,7 @@ from companion.config import Config
 from companion.errors import UserError
 from companion.sim.world import World
 from estimators.bounds import position_information
+from estimators.immutable import immutable
 from estimators.messages import FloatArray
 
 _CELLS = 60
@@ -41,7 +42,7 @@ class Spot:
     worst: float
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@immutable
 class Layout:
     """Accuracy over the floor, with the anchors there are and with one more.
 

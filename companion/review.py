@@ -1,7 +1,6 @@
 """Logs replayed into a scene, and what happened in them: before and after, or estimators side by side."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import rerun as rr
 
@@ -14,12 +13,13 @@ from companion.replay import Replay, replay
 from companion.view.blueprint import REVIEW_TRAIL, comparison_blueprint, run_blueprint
 from companion.view.files import BATCH
 from companion.view.scene import Scene
+from estimators.immutable import immutable
 
 ROOTS = ("before", "after")
 """Of two logs."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@immutable
 class Span:
     """The part of a log that is shown, in seconds since its start; `end` None = all the rest.
 
@@ -30,7 +30,7 @@ class Span:
     end: float | None = None
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@immutable
 class Review:
     """What was found in one log.
 

@@ -9,7 +9,7 @@ Source: MAVLink ardupilotmega.xml, SIMSTATE.
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from math import cos, degrees, radians
 from pathlib import Path
 
@@ -27,6 +27,7 @@ from companion.sim.followed import FollowedTrajectory
 from companion.sim.scenario import Scenario
 from drivers.mavlink_frames import MavlinkMessage
 from estimators.geometry import wrap_angle
+from estimators.immutable import immutable
 from estimators.messages import FloatArray
 
 TRUTH = "SIMSTATE"
@@ -34,7 +35,7 @@ TRUTH_RATE = 50.0
 _METRES_PER_DEGREE = 111_319.5
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@immutable
 class Placement:
     """Where the map lies on Earth.
 

@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -18,6 +17,7 @@ from estimators.graph.batch import AnchorFix, Smoothed, smooth
 from estimators.graph.errors import GraphError
 from estimators.graph.recording import PLACE_SIGMA, Noise, Recording
 from estimators.graph.smoother import GraphSmoother
+from estimators.immutable import immutable
 from estimators.messages import (
     FloatArray,
     IntArray,
@@ -32,7 +32,7 @@ SMOOTHED = "smoothed"
 """Name of the smoothed track beside the estimators'."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@immutable
 class SmoothedLog:
     """What smoothing a log gave.
 

@@ -17,6 +17,7 @@ from typing import TypeAlias
 
 from drivers.framing import ByteBuffer, DecodeStats
 from drivers.rplidar_nodes import Batch, Columns
+from estimators.immutable import immutable
 
 
 class Command(IntEnum):
@@ -241,7 +242,7 @@ class ScanStarted:
     scan_type: AnswerType
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@immutable
 class Samples:
     """Consecutive samples of a scan stream, in the order they were taken.
 

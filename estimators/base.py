@@ -1,11 +1,12 @@
 """What every estimator offers, and what it says of each measurement."""
 
-from dataclasses import dataclass, field
+from dataclasses import field
 from enum import StrEnum
 from typing import Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 
+from estimators.immutable import immutable
 from estimators.lidar.floor_map import FloorMap
 from estimators.lidar.scan_preparation import ScanPreparation
 from estimators.messages import FloatArray, Measurement, PoseEstimate
@@ -67,7 +68,7 @@ _EMPTY = np.empty(0)
 _NO_POSES = np.empty((0, 3))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@immutable
 class Report:
     """What an estimator did with one measurement.
 
@@ -87,7 +88,7 @@ class Report:
     iterations: int | None = None
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@immutable
 class Start:
     """Where the robot stands when the process starts, as the operator placed it.
 
@@ -104,7 +105,7 @@ class Start:
     known: bool = True
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@immutable
 class Setup:
     """Geometry that the site file states and every estimator needs.
 
@@ -195,7 +196,7 @@ def taken_by(estimator: Estimator) -> Taken:
     return estimator.takes if isinstance(estimator, Selective) else None
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@immutable
 class Sketch:
     """What an estimator holds besides its pose, for pictures.
 

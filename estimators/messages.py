@@ -5,17 +5,18 @@ Every stamp is an ``int`` of nanoseconds on the host's monotonic clock and says 
 true, not when its bytes arrived. Lengths are metres, angles radians, unless a name says otherwise.
 """
 
-from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
+from estimators.immutable import immutable
+
 FloatArray: TypeAlias = NDArray[np.float64]
 IntArray: TypeAlias = NDArray[np.int64]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@immutable
 class RangeFrame:
     """Ranges of one UWB tag to several anchors, taken in one ranging cycle.
 
@@ -36,7 +37,7 @@ class RangeFrame:
     fp_power: FloatArray
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@immutable
 class Scan:
     """One revolution of a planar LiDAR.
 
@@ -70,7 +71,7 @@ class Scan:
         )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@immutable
 class ImuSample:
     """One reading of an inertial sensor, in that sensor's own axes.
 
@@ -85,7 +86,7 @@ class ImuSample:
     accel: FloatArray
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@immutable
 class Attitude:
     """Orientation from a device that keeps its own attitude filter.
 
@@ -98,7 +99,7 @@ class Attitude:
     quat_wxyz: FloatArray
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@immutable
 class Height:
     """Distance to the ground below a sensor that looks down.
 
@@ -113,7 +114,7 @@ class Height:
     sigma: float
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@immutable
 class PoseIncrement:
     """Planar motion of the body between two instants, as odometry gives it.
 
@@ -136,7 +137,7 @@ class PoseIncrement:
     is_keyframe: bool
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@immutable
 class LoopClosure:
     """Planar motion of the body between two instants long apart: it came back to a place that it knows.
 
@@ -154,7 +155,7 @@ class LoopClosure:
     cov: FloatArray
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@immutable
 class LandmarkFrame:
     """Known landmarks as one look of a LiDAR or camera finds them, each already told from the others.
 
@@ -179,7 +180,7 @@ PLANAR = np.ix_([0, 1, 5], [0, 1, 5])
 """Rows and columns of (x, y, yaw) in the covariance of a PoseEstimate."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@immutable
 class PoseEstimate:
     """Pose of the body in the map with its uncertainty.
 

@@ -8,7 +8,6 @@ gains on another. Ranges, landmarks and scans do weigh the particles.
 
 from abc import abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import ClassVar, TypeAlias
 
 import numpy as np
@@ -16,6 +15,7 @@ from pydantic import Field
 
 from estimators.base import Report, Setup, Sketch, Verdict
 from estimators.fix_taker import FixTaker
+from estimators.immutable import immutable
 from estimators.lidar.keyframes import START_SPEED_SIGMA
 from estimators.messages import (
     FloatArray,
@@ -34,7 +34,7 @@ Likelihood: TypeAlias = Callable[[FloatArray], FloatArray]
 """Particles (N, 9) -> negative logarithm (N,) of how likely they make a measurement."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@immutable
 class Fixes:
     """Ranges and landmarks that passed their gates, as `estimators.kernels` has them: a `Likelihood`."""
 

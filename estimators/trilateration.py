@@ -1,10 +1,9 @@
 """Position of a tag in the plane from ranges to anchors, and both where two fit."""
 
-from dataclasses import dataclass
-
 import numpy as np
 from scipy.optimize import least_squares
 
+from estimators.immutable import immutable
 from estimators.messages import FloatArray
 
 COLLINEAR_LIMIT = 0.1
@@ -22,7 +21,7 @@ class AnchorGeometryError(ValueError):
     """The anchors cannot give a position in the plane."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@immutable
 class Fix:
     """A position from ranges.
 

@@ -15,6 +15,7 @@ from companion.calibration.recording import Recording
 from companion.config import Config
 from companion.errors import UserError
 from estimators.geometry import compose, wrap_angle
+from estimators.immutable import immutable
 from estimators.messages import FloatArray, IntArray, PoseIncrement
 from estimators.models.motion import increment
 from estimators.models.range_bias import RangeBias
@@ -24,7 +25,7 @@ _ROUNDS = 20
 _BLOCK_NS = 10**9
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@immutable
 class _Odometry:
     """One unbroken stretch of odometry.
 
@@ -41,7 +42,7 @@ class _Odometry:
     from_keyframe: FloatArray
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@immutable
 class _Sights:
     """Ranges during that stretch, a row each.
 
@@ -56,7 +57,7 @@ class _Sights:
     measured: FloatArray
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@immutable
 class _State:
     """Unknowns.
 

@@ -1,11 +1,11 @@
 """Range biases against known positions: a constant for each anchor, one growth with the distance for all."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from estimators.immutable import immutable
 from estimators.messages import FloatArray, RangeFrame
 from estimators.models.range_bias import RangeBias
 
@@ -21,7 +21,7 @@ _BLOCK = 1.0
 """Errors within a time like this [s] are alike; those further apart are taken for independent."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@immutable
 class Ranges:
     """Ranges of one anchor beside the true distances.
 
@@ -36,7 +36,7 @@ class Ranges:
     distances: FloatArray
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@immutable
 class AnchorFit:
     """Bias of one anchor's ranges.
 
@@ -69,7 +69,7 @@ class AnchorFit:
         return np.array([self.bias.corrected(r) for r in ranges.measured.tolist()]) - ranges.distances
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@immutable
 class Calibration:
     """Biases of all anchors.
 

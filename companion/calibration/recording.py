@@ -1,16 +1,16 @@
 """What a log holds for a calibration: ranges as measured, odometry, truth."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 from companion.config import Config
 from companion.errors import UserError
 from companion.log import Direction, Log, Truth
 from companion.pipeline import make_front_end, make_sensors
+from estimators.immutable import immutable
 from estimators.messages import Measurement, PoseIncrement, RangeFrame, Scan
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@immutable
 class Recording:
     """Measurements of a drive.
 

@@ -3,7 +3,6 @@
 import multiprocessing
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
 from enum import StrEnum
 from itertools import product
 from time import process_time
@@ -14,6 +13,7 @@ import numpy as np
 from companion.function_benchmark.functions import DIMENSIONS, FUNCTIONS, ITERATIONS, PAPER, POPULATION
 from companion.function_benchmark.rivals import RIVALS
 from estimators.beetle_antennae import SEARCHES, BeetleAntennaeSearch
+from estimators.immutable import immutable
 from estimators.messages import FloatArray
 
 EVALUATIONS = POPULATION * ITERATIONS
@@ -52,7 +52,7 @@ PAPER_SETTINGS = ("bas", "ibas", "pso", "ga", "ba")
 """The five algorithms of the paper, the beetles' equations corrected, with the settings it names."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@immutable
 class Run:
     """One run of one algorithm.
 
@@ -67,7 +67,7 @@ class Run:
     seconds: float
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@immutable
 class Outcome:
     """Several runs of one algorithm on one function.
 
@@ -86,7 +86,7 @@ class Outcome:
     history: FloatArray
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@immutable
 class Race:
     """All outcomes.
 

@@ -1,12 +1,11 @@
 """What went over the link to the autopilot, for those who watch: where it thinks it is, what it says."""
 
-from dataclasses import dataclass
-
 import numpy as np
 from pymavlink.dialects.v20 import all as mavlink2
 
 from companion.log import Direction, RawChunk
 from drivers.mavlink_frames import MavlinkMessage, MavlinkParser
+from estimators.immutable import immutable
 from estimators.messages import FloatArray
 
 MAX_LATENCY = 1.0
@@ -17,7 +16,7 @@ _WHOLE_TEXT = 50
 """Characters of a STATUSTEXT; only a full one may go on in the next."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@immutable
 class Heard:
     """Something that was said on the link.
 

@@ -1,15 +1,14 @@
 """A pose in the map as the autopilot wants it: north, east, down; forward, right, down."""
 
-from dataclasses import dataclass
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from estimators.geometry import wrap_angle
+from estimators.immutable import immutable
 from estimators.messages import FloatArray, PoseEstimate
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@immutable
 class NedPose:
     """Pose of the body (forward, right, down) in north, east, down.
 

@@ -4,7 +4,7 @@ For scenarios with a table `[increments]`. Devices and drivers are left out, so 
 second; what a measurement claims of its noise is what was drawn.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from companion.sim.scenario_tables import IncrementsTable, KidnapTable, Landmark
 from companion.sim.simulate import START_NS
 from estimators.base import Setup
 from estimators.geometry import between, rotation, transform_each, wrap_angle, wrap_angles
+from estimators.immutable import immutable
 from estimators.messages import (
     Attitude,
     FloatArray,
@@ -29,7 +30,7 @@ from estimators.messages import (
 TAG_ID = 1
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@immutable
 class MeasuredWalk:
     """What the sensors of a scenario measured, and the truth.
 

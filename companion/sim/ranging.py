@@ -1,16 +1,15 @@
 """How UWB ranges and their signal powers err."""
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
 from companion.sim.scenario import UwbTable
+from estimators.immutable import immutable
 from estimators.messages import FloatArray
 from estimators.models.range import two_way_range
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@immutable
 class Ranging:
     """Ranges as a tag reports them, all arrays of one shape.
 

@@ -1,6 +1,5 @@
 """Scenario files: a world, a walk and sensors with their faults, all from one seed."""
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, Self
 
@@ -28,6 +27,7 @@ from companion.sim.scenario_tables import (
 from companion.sim.trajectory import Trajectory
 from companion.sim.world import World
 from companion.text_file import read_text
+from estimators.immutable import immutable
 from estimators.messages import FloatArray
 
 
@@ -186,7 +186,7 @@ class ScenarioFile(Table):
         return inertial
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@immutable
 class Scenario:
     """A scenario with its seed drawn: ready to run.
 

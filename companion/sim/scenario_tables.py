@@ -1,6 +1,5 @@
 """Further tables of scenario files: random obstacles, gait, measurements without bytes, published figures."""
 
-from dataclasses import dataclass
 from typing import Annotated, Self
 
 import numpy as np
@@ -8,6 +7,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from companion.config import Coordinate, Table
+from estimators.immutable import immutable
 from estimators.messages import FloatArray
 
 Box = tuple[float, float, float, float, float, float]
@@ -99,7 +99,7 @@ class KidnapTable(Table):
         return self
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@immutable
 class Blockade:
     """Anchors that are not seen for a while.
 

@@ -1,7 +1,5 @@
 """Ticks that are drawn together, in the form in which they are drawn: arrays over time."""
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from companion.evaluate import Reference
@@ -9,10 +7,11 @@ from companion.log import Truth
 from companion.pipeline import Tick
 from estimators.base import Report
 from estimators.geometry import wrap_angles
+from estimators.immutable import immutable
 from estimators.messages import FloatArray, IntArray, LoopClosure, RangeFrame, Scan
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@immutable
 class Track:
     """Poses (N, 3) of x [m], y [m], yaw [rad] in the map, with their covariance (N, 3, 3).
 

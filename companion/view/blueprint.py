@@ -1,7 +1,7 @@
 """How a scene opens: which views there are, where, and on what scale."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import rerun.blueprint as rrb
@@ -9,6 +9,7 @@ import rerun.blueprint as rrb
 from companion.config import Config
 from companion.view.entities import TIME
 from companion.view.palette import GROUND
+from estimators.immutable import immutable
 
 REVIEW_TRAIL, LIVE_TRAIL = 8.0, 120.0
 """Length [s] of the bright trail behind a pose: in review the whole track is there too."""
@@ -18,7 +19,7 @@ _ERRORS = ("error/position", "error/yaw")
 _BY_ANCHOR = ("ranges/residual", "ranges/nis")
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@immutable
 class Layout:
     """What the views of one run are made from.
 

@@ -2,11 +2,11 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
 
+from estimators.immutable import immutable
 from estimators.messages import FloatArray
 
 Objective: TypeAlias = Callable[[FloatArray], FloatArray]
@@ -25,7 +25,7 @@ STEP_TO_ANTENNAE = 5.0
 """c of Eq. (11). huang2024 gives none; programs of BAS use this."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@immutable
 class Found:
     """What a search found.
 

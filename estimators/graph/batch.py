@@ -10,7 +10,7 @@ as they go together with the rest (`closures.solve_with_doubtful`).
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TypeAlias
 
 import numpy as np
@@ -23,6 +23,7 @@ from estimators.graph.factors import Graph
 from estimators.graph.losses import GAUSSIAN
 from estimators.graph.recording import Recording
 from estimators.graph.solver import Solution
+from estimators.immutable import immutable
 from estimators.messages import FloatArray, IntArray
 
 BoolArray: TypeAlias = NDArray[np.bool_]
@@ -34,7 +35,7 @@ _BLOCKED_FOR_NS = 500_000_000
 _ROUNDS = 6
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@immutable
 class AnchorFix:
     """What a recording says of an anchor.
 
@@ -59,7 +60,7 @@ class AnchorFix:
     residual_rms: float
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@immutable
 class Smoothed:
     """The most likely course of a recording.
 

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from estimators.graph.losses import GAUSSIAN, Loss
+from estimators.immutable import immutable
 from estimators.messages import FloatArray, IntArray
 
 FIXED, ALL, PLACE, BIAS = (0, 0, 0), (1, 1, 1), (1, 1, 0), (0, 0, 1)
@@ -197,7 +198,7 @@ def headings(pose: ArrayLike, yaw: ArrayLike, sigma: float) -> FloatArray:
     return priors(pose, at, np.diag([0.0, 0.0, sigma**-2]), is_pose=True)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@immutable
 class DensePrior:
     """What is known of several variables together, as a quadratic.
 

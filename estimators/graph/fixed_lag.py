@@ -15,7 +15,7 @@ moved: Kaess et al., iSAM2, International Journal of Robotics Research 31(2), 20
 """
 
 from collections.abc import Collection
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -23,6 +23,7 @@ from estimators.graph import factors
 from estimators.graph.errors import GraphError
 from estimators.graph.factors import DensePrior, Graph
 from estimators.graph.solver import arrays
+from estimators.immutable import immutable
 from estimators.kernels import optimise, window
 from estimators.kernels.window import BoolArray
 from estimators.messages import FloatArray, IntArray
@@ -36,7 +37,7 @@ _FARTHEST = 3.0
 linearised anew. By default that is 3 cm and 0.03 rad; iSAM2 as GTSAM ships it waits for 0.1 of either."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@immutable
 class _Settled:
     """A window when all of it was solved.
 

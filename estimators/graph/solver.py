@@ -1,6 +1,5 @@
 """The optimum of a graph, and how sure it is."""
 
-from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -9,6 +8,7 @@ from estimators.graph.checks import check, undetermined
 from estimators.graph.errors import GraphError
 from estimators.graph.factors import Graph
 from estimators.graph.ordering import elimination_order
+from estimators.immutable import immutable
 from estimators.kernels import block_cholesky, optimise
 from estimators.kernels.factors import GraphArrays, System, system_of
 from estimators.messages import FloatArray
@@ -16,7 +16,7 @@ from estimators.messages import FloatArray
 Method = Literal["gauss_newton", "levenberg_marquardt"]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@immutable
 class Solution:
     """The optimum of a graph.
 

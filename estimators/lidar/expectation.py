@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from estimators.geometry import compose, rotation, transform_each
+from estimators.immutable import immutable
 from estimators.kernels.scan_motion import bent, prior_on_states
 from estimators.kernels.scan_points import seen_from_end
 from estimators.lidar.known_motion import GyroTrack, OdometryTrack
@@ -28,7 +29,7 @@ _CLAMPED_RATIOS = (np.cosh(_CLAMPED_WAVES) - np.cos(_CLAMPED_WAVES)) / (
 )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@immutable
 class Expectation:
     """A scan and the states at its ends, before they are told by walls.
 

@@ -5,13 +5,12 @@ noise leave open, passes a gate, and no other feature passes it. Two features th
 one wall that was seen in two parts, and are made one.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
 from estimators import chi2
 from estimators.geometry import wrap_angles
+from estimators.immutable import immutable
 from estimators.lidar.feature_map import FeatureMap, Kind
 from estimators.lidar.features import Walls
 from estimators.lidar.sightings import STATES, Rows, SpotSightings, WallSightings
@@ -35,7 +34,7 @@ NEW, NONE = -1, -2
 """In place of a feature: the sighting is of a new one, or must not be used."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@immutable
 class Matches:
     """What became of K sightings.
 

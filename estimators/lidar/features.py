@@ -5,12 +5,11 @@ walls meet, both say all there is to say, and a point made of the two would coun
 is a thin thing that stands alone.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
 from estimators.geometry import wrap_angles
+from estimators.immutable import immutable
 from estimators.messages import FloatArray, IntArray
 
 STEEPEST = np.deg2rad(10.0)
@@ -44,7 +43,7 @@ _MEAN_DEPTH = np.pi / 4.0
 """Mean of how far a circle's near side stands out, in its radii."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@immutable
 class Walls:
     """Straight runs of points, K of them, N points in all.
 
@@ -86,7 +85,7 @@ NO_WALLS = Walls(
 )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@immutable
 class Spots:
     """Corners or poles, K of them.
 
@@ -105,7 +104,7 @@ class Spots:
     turn: FloatArray
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@immutable
 class Features:
     """What was found in a scan."""
 

@@ -1,6 +1,5 @@
 """A floor plan as cells, as it is saved and loaded; what to find oneself in."""
 
-from dataclasses import dataclass
 from math import log
 
 import numpy as np
@@ -8,6 +7,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
 from estimators.geometry import transform
+from estimators.immutable import immutable
 from estimators.lidar.occupancy_grid import OccupancyGrid
 from estimators.messages import FloatArray
 
@@ -15,7 +15,7 @@ FREE = log(0.25 / 0.75)
 """A cell with smaller log-odds was seen through often enough to be free."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@immutable
 class FloorMap:
     """Cells that are obstacles, free, or neither: never seen.
 

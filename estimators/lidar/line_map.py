@@ -1,10 +1,9 @@
 """A scan as local lines, to match points against; numba is loaded with this module."""
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
+from estimators.immutable import immutable
 from estimators.kernels import scan_fit as kernels
 from estimators.kernels.scan_lines import associate, fit_lines, sort_into_cells
 from estimators.kernels.scan_motion import newest_covariance, said_by_scan
@@ -18,7 +17,7 @@ CELLS = 4
 """Cells of the grid for each line: a cell along a wall then holds a few lines."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@immutable
 class Surface:
     """Points of a scan that lie on a line with their neighbours.
 
@@ -62,7 +61,7 @@ def surface(points: FloatArray, range_sigma: float, wanted: NDArray[np.bool_] | 
     return Surface(lines, spans, own, points.take(own, axis=0), np.ascontiguousarray(lines[:, 2:4]))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@immutable
 class Sums:
     """What all matched points say of the state, for distances of unit variance.
 

@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from estimators import chi2
 from estimators.geometry import between, compose, inverse, rotation, wrap_angle
+from estimators.immutable import immutable
 from estimators.messages import FloatArray, LoopClosure
 
 if TYPE_CHECKING:
@@ -42,7 +43,7 @@ class _Keyframe:
     lines: "LineMap"
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@immutable
 class _Fit:
     """Pose of one keyframe in another, its covariance, share of the surface points that fit."""
 

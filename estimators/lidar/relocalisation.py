@@ -1,6 +1,5 @@
 """Where in a known map a scan was taken: a global search that tells ambiguity in place of guessing."""
 
-from dataclasses import dataclass
 from enum import StrEnum
 from typing import TypeAlias
 
@@ -11,6 +10,7 @@ from scipy.ndimage import map_coordinates, maximum_filter
 from estimators import chi2
 from estimators.base import Setup
 from estimators.geometry import compose, rotation
+from estimators.immutable import immutable
 from estimators.lidar.floor_map import FloorMap
 from estimators.messages import FloatArray, RangeFrame
 from estimators.models.range import horizontal_range, reduce_height
@@ -33,7 +33,7 @@ class Finding(StrEnum):
     """The scan fits nowhere well enough."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@immutable
 class Candidate:
     """A place that a scan fits.
 
@@ -51,7 +51,7 @@ class Candidate:
     range_nis: float
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@immutable
 class Relocation:
     """Result of a search: the candidates, best first, and whether the first is the answer."""
 

@@ -1,11 +1,11 @@
 """Where the match of a scan begins, and what comes out of it."""
 
-from dataclasses import dataclass
 from itertools import product
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from estimators.immutable import immutable
 from estimators.messages import FloatArray, IntArray
 
 if TYPE_CHECKING:
@@ -25,7 +25,7 @@ NEWEST = np.arange(6, 9)
 """Where in both states (12,) the newer pose is: pose and velocity before, pose and velocity now."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@immutable
 class Fit:
     """A scan in place.
 

@@ -1,11 +1,10 @@
 """What becomes of a scan before anything is made of it: limits, thinning, levelling, lever arm."""
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
+from estimators.immutable import immutable
 from estimators.messages import Attitude, FloatArray, Measurement, Scan
 
 LEAST_GAP_NS = 1_000_000
@@ -14,7 +13,7 @@ MOST_ATTITUDE_AGE = 0.2
 """An older attitude [s] levels no scan."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@immutable
 class PreparedScan:
     """Where beams ended.
 

@@ -4,11 +4,10 @@ The states (12,) are pose and velocity at the end of the scan before, and at the
 the body follows a cubic, and every point is taken from where the body was at its own instant.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from estimators.geometry import transform_each
+from estimators.immutable import immutable
 from estimators.lidar.features import Spots, Walls
 from estimators.messages import FloatArray, IntArray
 
@@ -17,7 +16,7 @@ NOW = slice(6, 9)
 """Where the newest pose is among the states."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@immutable
 class Rows:
     """Scalar measurements, M of them.
 
@@ -64,7 +63,7 @@ NO_ROWS = Rows(
 )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@immutable
 class WallSightings:
     """Walls as this scan saw them, K of them, N points in all.
 
@@ -140,7 +139,7 @@ class WallSightings:
         )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@immutable
 class SpotSightings:
     """Corners or poles as this scan saw them, K of them.
 

@@ -6,7 +6,6 @@ bounded; for one that is too short never. Circles of any two anchors give places
 around are tried, and Gauss-Newton steps on all of them together end in the minima.
 """
 
-from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 
 from estimators import chi2
 from estimators.geometry import wrap_angles
+from estimators.immutable import immutable
 from estimators.messages import FloatArray
 from estimators.relocation.window import PlacedRanges
 from estimators.trilateration import circle_intersections
@@ -43,7 +43,7 @@ SAME_PLACE = np.array([0.3, 0.3, 0.35])
 """Minima nearer to each other than this are one [m, m, rad]."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@immutable
 class Minimum:
     """A pose that ranges along a way speak for.
 

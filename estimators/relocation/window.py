@@ -8,6 +8,7 @@ import numpy as np
 
 from estimators.base import Setup, Verdict
 from estimators.geometry import compose, inverse, transform, wrap_angle
+from estimators.immutable import immutable
 from estimators.lidar.keyframes import is_covariance
 from estimators.messages import FloatArray, IntArray, PoseIncrement, RangeFrame
 from estimators.range_gate import HorizontalRanges
@@ -19,7 +20,7 @@ MOST_RANGES = 250
 _NO_POSE = np.zeros(3)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@immutable
 class PlacedRanges:
     """Ranges along a piece of way. Its frame is the body's at the newest keyframe.
 
@@ -71,7 +72,7 @@ class _Frame:
     until: int = 0  # ranges on the way up to the last of these
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@immutable
 class _Step:
     begin: FloatArray
     end: FloatArray

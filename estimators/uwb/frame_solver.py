@@ -1,7 +1,6 @@
 """UWB alone, frame by frame, by a solver of choice: in the plane at the site's height, or in space."""
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
 from math import sqrt
 from typing import ClassVar
 
@@ -10,6 +9,7 @@ from pydantic import Field
 
 from estimators.base import Report, Setup, Verdict
 from estimators.geometry import lift
+from estimators.immutable import immutable
 from estimators.least_squares import LeastSquares
 from estimators.messages import FloatArray, Measurement, PoseEstimate, RangeFrame
 from estimators.models.range import reduce_height
@@ -20,7 +20,7 @@ MIN_INFORMATION = 1e-6
 """Least information of N ranges of unit variance along any axis, over N; below it there is no position."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@immutable
 class TagFix:
     """Position of the tag from one frame.
 

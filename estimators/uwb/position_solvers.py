@@ -5,17 +5,17 @@ form comes near it, the descents reach it.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 
+from estimators.immutable import immutable
 from estimators.messages import FloatArray
 
 COPLANAR_LIMIT = 0.1
 """Least spread [m] of the anchors across their best-fit plane; below it above and below look the same."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@immutable
 class Solution:
     """Where a solver ended.
 

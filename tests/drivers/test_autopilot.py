@@ -1,5 +1,6 @@
 """What an autopilot measures: units, axes, stamps, echoes; increments of wheels and odometry."""
 
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -276,7 +277,7 @@ def test_no_number_in_a_message_makes_a_measurement_that_is_not_finite(
         "wheels": lambda: mavlink2.MAVLink_wheel_distance_message(usec, 2, [a, b] + [c] * 14),
     }[kind]()
     for measurement in line.say(message, component=197 if kind == "odometry" else 1):
-        values = [getattr(measurement, slot) for slot in type(measurement).__slots__]
+        values = [getattr(measurement, field.name) for field in fields(measurement)]
         assert all(np.isfinite(value).all() for value in values)
 
 

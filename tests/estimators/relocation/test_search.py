@@ -1,5 +1,6 @@
 """The search against independent optimisers, and its covariance against what its errors really are."""
 
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -133,24 +134,19 @@ def test_drift_moves_the_found_pose_as_much_as_the_covariance_says() -> None:
     # One step of the odometry is shifted: the pose follows by what linear propagation gives.
     placed, _ = placed_by(Robot(ROOM, 3, clear), 4.0)
     found = find_pose(placed, 0.0)
-    without = find_pose(_replace_covs(placed, np.zeros_like(placed.step_covs)), 0.0)
+    without = find_pose(replace(placed, step_covs=np.zeros_like(placed.step_covs)), 0.0)
     assert found is not None
     assert without is not None
     k, size = 3, 1e-3
     for axis in range(3):
         covs = np.zeros_like(placed.step_covs)
         covs[k, axis, axis] = size**2
-        told = find_pose(_replace_covs(placed, covs), 0.0)
+        told = find_pose(replace(placed, step_covs=covs), 0.0)
         assert told is not None
         shifts = np.sqrt(np.maximum(np.diag(told.cov) - np.diag(without.cov), 0.0))
         really = find_pose(_with_step_off(placed, k, axis, size), 0.0)
         assert really is not None
         np.testing.assert_allclose(np.abs(pose_error(really.pose, found.pose)), shifts, atol=0.25 * size)
-
-
-def _replace_covs(placed: PlacedRanges, covs: FloatArray) -> PlacedRanges:
-    fields = {name: getattr(placed, name) for name in PlacedRanges.__slots__}
-    return PlacedRanges(**(fields | {"step_covs": covs}))
 
 
 def _with_step_off(placed: PlacedRanges, k: int, axis: int, size: float) -> PlacedRanges:
@@ -163,8 +159,7 @@ def _with_step_off(placed: PlacedRanges, k: int, axis: int, size: float) -> Plac
     else:
         unit = np.eye(2)[axis]
         tags[older] -= size * transform(np.array([0.0, 0.0, begin[2]]), unit[None])
-    fields = {name: getattr(placed, name) for name in PlacedRanges.__slots__}
-    return PlacedRanges(**(fields | {"tags": tags}))
+    return replace(placed, tags=tags)
 
 
 def test_share_of_ranges_too_short_is_none_at_the_right_pose_and_many_at_a_wrong_one() -> None:
