@@ -137,6 +137,10 @@ class HealthMonitor:
         anchor_ids: Iterable[int] = (),
         needs_heading: bool = True,
     ) -> None:
+        # Numba loads slowly: only who judges poses waits for it.
+        from estimators.kernels import soundness
+
+        self._soundness = soundness
         self._table = table
         self._anchor_ids = tuple(anchor_ids)
         self._heard: dict[int, tuple[int, Verdict]] = {}
@@ -252,14 +256,16 @@ class HealthMonitor:
         awaited = [s.what for s in sources if s.first_awaited and not s.is_stale]
         if awaited:
             return Health(State.STARTING, f"waiting for a {awaited[0]}")
-        cov = pose.cov[: self._used, : self._used]
         variance_yaw = float(pose.cov[5, 5])
         if variance_yaw == inf and self._used == 6:
             what = self._note or self._heading_advice or "start again on the start mark"
             return Health(State.LOST, f"heading not known: {what}", self._note or "heading not known")
-        if not (np.isfinite(pose.T_map_body).all() and np.isfinite(cov).all()):
+        soundness = self._soundness.soundness(
+            np.ascontiguousarray(pose.T_map_body), np.ascontiguousarray(pose.cov), self._used
+        )
+        if soundness == self._soundness.NOT_FINITE:
             return Health(State.LOST, "pose or covariance is not finite")
-        if np.linalg.eigvalsh(cov)[0] <= 0.0:
+        if soundness == self._soundness.NOT_DEFINITE:
             return Health(State.LOST, "covariance is not positive definite")
         sigma_xy = _widest(pose.cov[:2, :2])
         if sigma_xy > table.max_sigma_xy:
