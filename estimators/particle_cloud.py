@@ -24,7 +24,7 @@ from estimators.messages import (
     PoseIncrement,
     RangeFrame,
 )
-from estimators.range_gate import RangeGate
+from estimators.range_gate import Candidates, RangeGate
 
 POSE, VELOCITY, KEYFRAME = slice(0, 3), slice(3, 6), slice(6, 9)
 _NO_RANGES, _NO_LANDMARKS = np.empty((0, 4)), np.empty((0, 6))
@@ -76,6 +76,8 @@ class ParticleCloud(FixTaker):
 
     def reset(self) -> None:
         """Stand at the start again, trust every anchor, and draw the same numbers again."""
+        self.judged: Candidates | None = None
+        """The newest frame of ranges; their sigmas are those they were used with, infinite without."""
         self._rng = np.random.default_rng(self._seed)
         super().reset()
 
@@ -161,6 +163,7 @@ class ParticleCloud(FixTaker):
         arm = self._setup.arm(frame.tag_id)
         expected = self._likelihood.expected_residuals(self._particles, self._weights, arm, candidates.rows)
         report = self._gate.judge_together(candidates, *expected)
+        self.judged = candidates
         if any(verdict.is_used for verdict in report.verdicts):
             fixes = Fixes(self._likelihood.misfits, arm, candidates.rows, _NO_LANDMARKS)
             self._take(fixes(self._particles), fixes)

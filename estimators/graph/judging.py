@@ -16,7 +16,7 @@ from estimators.landmark_gate import LandmarkGate
 from estimators.messages import FloatArray, LandmarkFrame, RangeFrame
 from estimators.models.landmark import range_and_bearing
 from estimators.models.range import horizontal_range
-from estimators.range_gate import HorizontalRanges, RangeGate
+from estimators.range_gate import Candidates, RangeGate
 
 
 @dataclass(slots=True, eq=False)
@@ -79,37 +79,19 @@ def judge_ranges(
     return Report(tuple(verdicts), residuals, nis), _range_rows(believed, arm)
 
 
-def believed_ranges(
-    horizontal: HorizontalRanges,
-    frame: RangeFrame,
-    pose: FloatArray,
-    yaw_variance: float,
-    verdicts: Sequence[Verdict],
-    arm: FloatArray,
-    numbers: Mapping[int, int],
-) -> FloatArray:
+def believed_ranges(judged: Candidates, verdicts: Sequence[Verdict], arm: FloatArray) -> FloatArray:
     """Ranges that a filter accepted as rows of `factors.ranges`, whose pose is not known yet.
 
-    Those that it weighed down are not among them: a verdict does not tell by how much.
+    Those that it weighed down are not among them.
 
     Args:
-        horizontal: height reduction, as the filter's.
-        frame: the ranges.
-        pose: (3,) predicted x [m], y [m], yaw [rad] of the body in the map.
-        yaw_variance: of its yaw [rad^2].
+        judged: the ranges, with the sigmas that the filter used.
         verdicts: the filter's on each of them.
         arm: (3,) tag antenna in the body frame [m].
-        numbers: anchor id -> variable in the graph.
     """
-    candidates = horizontal.of(frame, pose, yaw_variance)
-    believed = [
-        (numbers[anchor_id], *row[2:])
-        for anchor_id, verdict, item, row in zip(
-            frame.anchor_ids.tolist(), verdicts, candidates.verdicts, candidates.rows.tolist(), strict=True
-        )
-        if verdict is Verdict.ACCEPTED and item is Verdict.WAITING
-    ]
-    return _range_rows(believed, arm)
+    accepted = np.array([verdict is Verdict.ACCEPTED for verdict in verdicts], dtype=np.bool_)
+    measured, sigmas = judged.rows[accepted, 2:].T
+    return factors.ranges(-1, judged.anchors[accepted], measured, sigmas, arm[:2])
 
 
 def judge_landmarks(

@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 
-from estimators.base import Report, Setup, Sketch, Verdict
+from estimators.base import Report, Setup, Sketch
 from estimators.geometry import wrap_angle
 from estimators.graph.smoother import GraphSmoother
 from estimators.messages import FloatArray, LandmarkFrame, Measurement, RangeFrame
@@ -50,18 +50,11 @@ class PfIbasGraph(GraphSmoother):
         """The filter's particles and the graph's window."""
         return replace(super().sketch(), particles=self._filter.sketch().particles)
 
-    def _judge(self, frame: RangeFrame | LandmarkFrame, mean: FloatArray, cov: FloatArray) -> Report:
-        if not isinstance(frame, RangeFrame) or Verdict.LATE in self._said.verdicts:
-            return super()._judge(frame, mean, cov)
-        rows = self._judging.believed_ranges(
-            self._gate.horizontal,
-            frame,
-            mean[:3],
-            cov[2, 2],
-            self._said.verdicts,
-            self._setup.arm(frame.tag_id),
-            self._anchor_numbers,
-        )
+    def _judge_newest(self, frame: RangeFrame | LandmarkFrame) -> Report:
+        judged = self._filter.judged
+        if judged is None or judged.frame is not frame:
+            return super()._judge_newest(frame)
+        rows = self._judging.believed_ranges(judged, self._said.verdicts, self._setup.arm(frame.tag_id))
         return self._taken(frame.stamp_ns, "ranges", rows, self._said)
 
     def _guess(self, stamp_ns: int) -> FloatArray:

@@ -98,7 +98,7 @@ class GraphSmoother(KeyframeTracker):
                 return self._update_late(measurement)
             if not isinstance(measurement, PoseIncrement):
                 self._predict_to(measurement.stamp_ns)
-                return self._judge(measurement, *self._predicted(measurement.stamp_ns))
+                return self._judge_newest(measurement)
         if isinstance(measurement, LoopClosure):
             return self._update_closure(measurement)
         report = super().update(measurement)
@@ -167,6 +167,10 @@ class GraphSmoother(KeyframeTracker):
         self._keep_keyframe(self._stamp_ns)
         for block in (self._mean, self._cov, self._cov.T):
             block[REFERENCE] = block[POSE]
+
+    def _judge_newest(self, frame: RangeFrame | LandmarkFrame) -> Report:
+        """Take what is believed of a frame that is newer than all before."""
+        return self._judge(frame, *self._predicted(frame.stamp_ns))
 
     def _judge(self, frame: RangeFrame | LandmarkFrame, mean: FloatArray, cov: FloatArray) -> Report:
         """Take what is believed of a frame, against the state at its instant."""

@@ -13,7 +13,8 @@ def _matrix(seed: int, values: list[float]) -> FloatArray:
     """A symmetric matrix (N, N) with these eigenvalues."""
     turn, _ = np.linalg.qr(np.random.default_rng(seed).normal(size=(len(values), len(values))))
     product = turn * values @ turn.T
-    return 0.5 * (product + product.T)
+    symmetric: FloatArray = 0.5 * (product + product.T)
+    return symmetric
 
 
 @given(
