@@ -100,24 +100,29 @@ def bent(
     Each mode moves the beams, and by them the pose that fits best.
 
     Args:
-        modes: (K, N) of the motion at the instants of the beams.
-        shares: (N,) of the way in time from the scan before to this one, of the beams.
+        modes: (T, K) of the motion at instants that are spread evenly over the time from the scan before to
+            this one; between them they are straight.
+        shares: (N,) of that time, of the beams; outside of it modes are as at its ends.
         rows: (N, 6) of `associate`.
         index: (N,) of `associate`; beams without a line say nothing.
         deviation: (3, 3) covariance of what the modes are multiples of.
     """
-    count = len(modes)
-    hessian, pulls = LEAST_HESSIAN * np.eye(3), np.zeros((3, count, 3))
+    last, count = len(modes) - 1, modes.shape[1]
+    hessian, pulls, mode = LEAST_HESSIAN * np.eye(3), np.zeros((3, count, 3)), np.empty(count)
     for i in range(len(rows)):
         if index[i] < 0:
             continue
+        place = last * min(max(shares[i], 0.0), 1.0)
+        before = min(int(place), last - 1)
+        for k in range(count):
+            mode[k] = modes[before, k] + (place - before) * (modes[before + 1, k] - modes[before, k])
         for a in range(3):
             by_end = shares[i] * rows[i, 1 + a]
             for b in range(3):
                 by_both = by_end * rows[i, 1 + b]
                 hessian[a, b] += shares[i] * by_both
                 for k in range(count):
-                    pulls[a, k, b] += modes[k, i] * by_both
+                    pulls[a, k, b] += mode[k] * by_both
     gains = np.linalg.solve(hessian, pulls.reshape(3, 3 * count))
     cov = np.zeros((3, 3))
     for k in range(count):

@@ -4,7 +4,6 @@ With odometry from outside the states are those of its drift: seen from a body t
 says, the robot stands still but for the odometry's error. With a gyroscope this holds of the heading alone.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -43,8 +42,8 @@ class Expectation:
         Q: (6, 6) its noise.
         twist: (3,) known velocity at the end, body frame; the states' comes on top of it.
         deviation: (3, 3) covariance of what `modes` are multiples of.
-        modes: how motion between the states deviates from the one that is assumed: (K, M) for shares (M,) of
-            the time from the scan before.
+        modes: (T, K) how motion between the states deviates from the one that is assumed, at instants that
+            are spread evenly over the time from the scan before.
     """
 
     points: FloatArray
@@ -56,7 +55,7 @@ class Expectation:
     Q: FloatArray
     twist: FloatArray
     deviation: FloatArray
-    modes: Callable[[FloatArray], FloatArray]
+    modes: FloatArray
 
     def prior(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Information (12, 12) on the states, the states (12,), and doubt (3,) of the newer pose (sigmas)."""
@@ -74,24 +73,27 @@ class Expectation:
             rows: (M, 6) what `associate` says of them.
             index: (M,) likewise.
         """
-        shares = self.shares.take(own)
-        return bent(self.modes(shares), shares, rows, index, self.deviation)
+        return bent(self.modes, self.shares.take(own), rows, index, self.deviation)
 
 
 def bridge(shares: FloatArray) -> FloatArray:
-    """Modes (6, M) by which a random walk of unit variance deviates from a straight line."""
-    phases: FloatArray = np.outer(_WAVES, shares)
-    modes: FloatArray = np.sqrt(2.0) * np.sin(phases) / _WAVES[:, None]
+    """Modes (M, 6) by which a random walk of unit variance deviates from a straight line."""
+    phases: FloatArray = np.outer(shares, _WAVES)
+    modes: FloatArray = np.sqrt(2.0) * np.sin(phases) / _WAVES
     return modes
 
 
 def clamped_bar(shares: FloatArray) -> FloatArray:
-    """Modes (3, M) by which motion under white acceleration deviates from a cubic, of unit power."""
-    waves, ratio = _CLAMPED_WAVES[:, None], _CLAMPED_RATIOS[:, None]
-    phases = waves * np.clip(shares, 0.0, 1.0)
-    shape = np.cosh(phases) - np.cos(phases) - ratio * (np.sinh(phases) - np.sin(phases))
-    modes: FloatArray = shape / waves**2
+    """Modes (M, 3) by which motion under white acceleration deviates from a cubic, of unit power."""
+    phases = np.outer(shares, _CLAMPED_WAVES)
+    shape = np.cosh(phases) - np.cos(phases) - _CLAMPED_RATIOS * (np.sinh(phases) - np.sin(phases))
+    modes: FloatArray = shape / _CLAMPED_WAVES**2
     return modes
+
+
+# Straight lines between so many instants are off by at most a ten-thousandth of a mode.
+_INSTANTS = np.linspace(0.0, 1.0, 1025)
+_BRIDGE_MODES, _BAR_MODES = bridge(_INSTANTS), clamped_bar(_INSTANTS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,7 +159,7 @@ def expect(
             Q,
             twist,
             _sway(Q, dt),
-            clamped_bar,
+            _BAR_MODES,
         )
     F, Q = smooth_motion(dt, noise.accel, noise.yaw_accel, noise.bandwidth)
     return Expectation(
@@ -170,7 +172,7 @@ def expect(
         Q,
         np.zeros(3),
         _sway(Q, dt),
-        clamped_bar,
+        _BAR_MODES,
     )
 
 
@@ -219,5 +221,5 @@ def _along_odometry(
         Q,
         odometry.twist(),
         drift,
-        bridge,
+        _BRIDGE_MODES,
     )

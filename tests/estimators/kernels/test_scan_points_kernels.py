@@ -107,12 +107,13 @@ def test_prior_on_both_states_is_the_inverse_of_their_joint_covariance(seed: int
 def test_a_mode_of_motion_bends_a_scan_by_what_least_squares_makes_of_it(seed: int) -> None:
     rng = np.random.default_rng(seed)
     rows, index = rng.standard_normal((40, 6)), rng.integers(-1, 5, 40)
-    shares, modes = rng.uniform(0.1, 1.0, 40), rng.standard_normal((3, 40))
+    shares, modes = rng.uniform(-0.1, 1.1, 40), rng.standard_normal((9, 3))
     half = rng.standard_normal((3, 5))
     deviation, expected = half @ half.T, np.zeros((3, 3))
     kept = index >= 0
     by_end = shares[kept, None] * rows[kept, 1:4]
-    for mode in modes:
+    for column in modes.T:
+        mode = np.interp(shares, np.linspace(0.0, 1.0, 9), column)
         # The distances change by the mode times the derivative; the pose at the end takes up what it can.
         moved = np.linalg.solve(
             by_end.T @ by_end + LEAST_HESSIAN * np.eye(3), by_end.T @ (mode[kept, None] * rows[kept, 1:4])

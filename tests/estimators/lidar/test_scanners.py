@@ -113,7 +113,7 @@ def test_a_scanner_that_is_too_slow_for_the_motion_says_how_far_it_may_be_off() 
 def test_modes_of_a_clamped_bar_have_the_variance_of_motion_between_known_ends() -> None:
     # Covariance of the Gaussian process between two known poses and velocities: (s (1 - s))**3 / 3.
     shares = np.linspace(0.0, 1.0, 41)
-    variance = (clamped_bar(shares) ** 2).sum(axis=0)
+    variance = (clamped_bar(shares) ** 2).sum(axis=1)
     np.testing.assert_allclose(variance, (shares * (1.0 - shares)) ** 3 / 3.0, atol=0.03 / 192.0)
 
 
