@@ -28,6 +28,7 @@ class Candidates:
         rows: (N, 4) anchor x and y [m], map frame, horizontal range and its standard deviation [m], as
             `estimators.kernels` has them; of infinite sigma where something is wrong.
         bias_by_pose: (N, 3) derivative by the pose of what was taken off for the bearing.
+        codes: (N,) verdicts of `RangeGate.judge_together` as `estimators.kernels` has them.
     """
 
     frame: RangeFrame
@@ -36,6 +37,7 @@ class Candidates:
     anchors: IntArray
     rows: FloatArray
     bias_by_pose: FloatArray
+    codes: IntArray
 
 
 class HorizontalRanges:
@@ -89,7 +91,7 @@ class HorizontalRanges:
             # What is taken off the slant range changes the horizontal one as the noise does.
             slopes[usable] *= rows[usable, 3:] / self._sigma
         verdicts = [Verdict.WAITING if k >= 0 else kernels.VERDICTS[k] for k in anchors.tolist()]
-        return Candidates(frame, pose.copy(), verdicts, anchors, rows, slopes)
+        return Candidates(frame, pose.copy(), verdicts, anchors, rows, slopes, np.empty_like(anchors))
 
 
 class RangeGate:
@@ -215,8 +217,8 @@ class RangeGate:
             mean: (N,) measured minus predicted [m]; is corrected by what is used.
             cov: (N, N) of the predictions [m^2], likewise.
         """
-        frame, count = candidates.frame, len(mean)
-        codes, report = np.empty(count, dtype=np.int64), np.full((3, count), np.nan)
+        frame, codes, count = candidates.frame, candidates.codes, len(mean)
+        report = np.full((3, count), np.nan)
         begin = 0
         while True:
             begin = self._kernels.judge_together(

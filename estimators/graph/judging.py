@@ -12,6 +12,8 @@ import numpy as np
 from estimators.base import Report, Verdict
 from estimators.geometry import wrap_angle
 from estimators.graph import factors
+from estimators.kernels import factor_rows
+from estimators.kernels.range_gate import ACCEPTED
 from estimators.landmark_gate import LandmarkGate
 from estimators.messages import FloatArray, LandmarkFrame, RangeFrame
 from estimators.models.landmark import range_and_bearing
@@ -79,19 +81,16 @@ def judge_ranges(
     return Report(tuple(verdicts), residuals, nis), _range_rows(believed, arm)
 
 
-def believed_ranges(judged: Candidates, verdicts: Sequence[Verdict], arm: FloatArray) -> FloatArray:
+def believed_ranges(judged: Candidates, arm: FloatArray) -> FloatArray:
     """Ranges that a filter accepted as rows of `factors.ranges`, whose pose is not known yet.
 
     Those that it weighed down are not among them.
 
     Args:
-        judged: the ranges, with the sigmas that the filter used.
-        verdicts: the filter's on each of them.
+        judged: by the filter's gate, together.
         arm: (3,) tag antenna in the body frame [m].
     """
-    accepted = np.array([verdict is Verdict.ACCEPTED for verdict in verdicts], dtype=np.bool_)
-    measured, sigmas = judged.rows[accepted, 2:].T
-    return factors.ranges(-1, judged.anchors[accepted], measured, sigmas, arm[:2])
+    return factor_rows.ranges(judged.anchors, judged.rows, judged.codes, ACCEPTED, *arm[:2].tolist())
 
 
 def judge_landmarks(

@@ -65,10 +65,10 @@ class GraphSmoother(KeyframeTracker):
     def __init__(self, config: Config, setup: Setup) -> None:
         # Numba loads slowly: only who makes a smoother waits for it.
         from estimators.graph import fixed_lag, judging
-        from estimators.kernels import motion
+        from estimators.kernels import factor_rows, motion
 
         super().__init__(config, setup)
-        self._fixed_lag, self._judging, self._motion = fixed_lag, judging, motion
+        self._fixed_lag, self._judging, self._motion, self._rows = fixed_lag, judging, motion, factor_rows
         self._lag_ns = round(config.lag * 1e9)
         self._most_places = config.places
         self._gate = RangeGate(config, setup)
@@ -254,7 +254,7 @@ class GraphSmoother(KeyframeTracker):
         variable = self._window.variable(place)
         at, now = self._window.graph.values[variable], self._window.newest[0]
         nis = self._nis(measured, at, now, cov)
-        rows = factors.increments(variable, -1, measured.increment, measured.cov)
+        rows = self._rows.increment(variable, measured.increment, measured.cov)
         passes = nis <= self._increment_gate and self._take(measured.stamp_ns, "increments", rows)
         return Report((Verdict.ACCEPTED if passes else Verdict.GATED,), np.full(1, np.nan), np.array([nis]))
 
@@ -269,7 +269,7 @@ class GraphSmoother(KeyframeTracker):
         reference = self._node_of_keyframe(measured.from_stamp_ns)
         if node is None or reference is None or node == reference:
             return False
-        rows = factors.increments(self._window.variable(reference), -1, measured.increment, measured.cov)
+        rows = self._rows.increment(self._window.variable(reference), measured.increment, measured.cov)
         return self._take(measured.stamp_ns, "increments", rows)
 
     def _take(self, stamp_ns: int, table: str, rows: FloatArray) -> bool:

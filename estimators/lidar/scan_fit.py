@@ -79,7 +79,9 @@ def search_start(
     """
     if 2.0 * max(doubt[0], doubt[1], doubt[2] * max(greatest, reach)) < reach:
         return predicted
-    far = float(np.percentile(np.hypot(found.points[:, 0], found.points[:, 1]), 75))
+    distances = np.hypot(found.points[:, 0], found.points[:, 1])
+    most = 3 * len(distances) // 4
+    far = float(np.partition(distances, most)[most])
     steps = reach / np.array([1.0, 1.0, max(far, reach)])
     x, y, yaw = np.minimum(2.0 * doubt // steps, MOST_STEPS).astype(int)
     if not (x or y or yaw):
