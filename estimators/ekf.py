@@ -8,7 +8,6 @@ from estimators.geometry import wrap_angle
 from estimators.lidar.odometry import POSE, LidarOdometry
 from estimators.messages import FloatArray, LandmarkFrame, RangeFrame
 from estimators.models.landmark import range_and_bearing
-from estimators.models.range import horizontal_range
 
 
 class Ekf(FixTaker, LidarOdometry):
@@ -38,15 +37,12 @@ class Ekf(FixTaker, LidarOdometry):
     def _update_ranges(self, frame: RangeFrame) -> Report:
         pose, arm = self._filter.x[POSE], self._setup.arm(frame.tag_id)
         candidates = self._gate.horizontal.of(frame, pose, float(self._filter.P[2, 2]))
-        residuals, H = np.zeros(len(frame.ranges)), np.zeros((len(frame.ranges), 9))
-        for i, (x, y, measured, _) in enumerate(candidates.rows.tolist()):
-            if candidates.verdicts[i] is Verdict.WAITING:
-                predicted, by_pose = horizontal_range(pose, (x, y), arm)
-                residuals[i], H[i, POSE] = measured - predicted, by_pose + candidates.bias_by_pose[i]
-        report = self._gate.judge_together(candidates, residuals.copy(), H @ self._filter.P @ H.T)
+        report, residuals, by_pose = self._gate.judge_at(candidates, self._filter.P, arm)
         sigmas = candidates.rows[:, 3]
         used = np.isfinite(sigmas)
         if used.any():
+            H = np.zeros((len(residuals), 9))
+            H[:, POSE] = by_pose
             self._correct(residuals[used], H[used], np.diag(sigmas[used] ** 2))
         return report
 

@@ -182,32 +182,28 @@ class RangeGate:
         if self._visibility is not None:
             self._visibility.see(measurement, pose_at)
 
-    def judge(self, candidates: Candidates, k: int, residual: float, nis: float) -> tuple[Verdict, float]:
-        """Verdict on a range, and by how much its sigma is to be multiplied when it is used.
+    def judge_at(
+        self, candidates: Candidates, cov: FloatArray, arm: FloatArray
+    ) -> tuple[Report, FloatArray, FloatArray]:
+        """Verdicts on ranges of a frame from the pose that the body is predicted at.
 
         Args:
-            candidates: ranges of a frame.
-            k: which of them; nothing is wrong with it so far.
-            residual: measured minus predicted [m], before the range is used.
-            nis: normalised innovation squared, likewise.
+            candidates: N ranges; their sigmas become those they are to be used with, infinite without.
+            cov: (K, K) beginning with x, y, yaw of the pose.
+            arm: (3,) tag antenna in the body frame [m].
+
+        Returns:
+            The report; measured minus predicted (N,) [m]; derivative of the predicted by the pose (N, 3).
         """
-        frame, looked = candidates.frame, np.nan
-        while True:
-            code, factor = self._kernels.judged(
-                self._state,
-                self._settings,
-                candidates.anchors[k],
-                frame.stamp_ns,
-                frame.rx_power[k],
-                frame.fp_power[k],
-                candidates.rows[k, 3],
-                residual,
-                nis,
-                looked,
-            )
-            if code != self._kernels.LOOK:
-                return self._kernels.VERDICTS[code], factor
-            looked = self._look(candidates, k)
+        residuals, by_pose, spread = self._kernels.expected_at(
+            candidates.anchors,
+            candidates.rows,
+            candidates.bias_by_pose,
+            candidates.pose,
+            np.ascontiguousarray(cov),
+            *arm[:2].tolist(),
+        )
+        return self.judge_together(candidates, residuals.copy(), spread), residuals, by_pose
 
     def judge_together(self, candidates: Candidates, mean: FloatArray, cov: FloatArray) -> Report:
         """Verdicts on ranges of a frame that are expected together.

@@ -91,13 +91,6 @@ def ranges(
     return rows
 
 
-def horizontal_range(
-    anchor: int, measured: float, sigma: float, arm_x: float, arm_y: float
-) -> tuple[float, ...]:
-    """Row as of `ranges` for a range in the plane whose pose is not known yet."""
-    return -1.0, anchor, measured, sigma, arm_x, arm_y, 0.0, GAUSSIAN.kind, GAUSSIAN.scale
-
-
 def sightings(
     pose: ArrayLike,
     landmark: ArrayLike,

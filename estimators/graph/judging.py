@@ -4,7 +4,7 @@ Each is held against the state predicted to its instant, corrected by those of t
 believed before it, as an extended Kalman filter does.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,11 +13,10 @@ from estimators.base import Report, Verdict
 from estimators.geometry import wrap_angle
 from estimators.graph import factors
 from estimators.kernels import factor_rows
-from estimators.kernels.range_gate import ACCEPTED
+from estimators.kernels.range_gate import ACCEPTED, DOWNWEIGHTED
 from estimators.landmark_gate import LandmarkGate
 from estimators.messages import FloatArray, LandmarkFrame, RangeFrame
 from estimators.models.landmark import range_and_bearing
-from estimators.models.range import horizontal_range
 from estimators.range_gate import Candidates, RangeGate
 
 
@@ -47,7 +46,7 @@ class Belief:
 
 
 def judge_ranges(
-    gate: RangeGate, frame: RangeFrame, belief: Belief, arm: FloatArray, numbers: Mapping[int, int]
+    gate: RangeGate, frame: RangeFrame, belief: Belief, arm: FloatArray
 ) -> tuple[Report, FloatArray]:
     """Verdicts on the ranges of a frame, and those that are believed as factors.
 
@@ -56,41 +55,27 @@ def judge_ranges(
     Args:
         gate: decides; remembers which anchors it doubts.
         frame: the ranges.
-        belief: state at the frame's instant; it is corrected.
+        belief: state at the frame's instant.
         arm: (3,) tag antenna in the body frame [m].
-        numbers: anchor id -> variable in the graph.
 
     Returns:
         The report; rows of `factors.ranges`, whose pose is not known yet.
     """
-    residuals, nis = np.full((2, len(frame.ranges)), np.nan)
-    believed = []
     candidates = gate.horizontal.of(frame, belief.mean[:3], belief.cov[2, 2])
-    verdicts, anchor_ids = candidates.verdicts, frame.anchor_ids.tolist()
-    for i, (x, y, measured, sigma) in enumerate(candidates.rows.tolist()):
-        if verdicts[i] is not Verdict.WAITING:
-            continue
-        predicted, by_pose = horizontal_range(belief.mean, (x, y), arm)
-        H, R = (by_pose + candidates.bias_by_pose[i])[None], np.array([[sigma**2]])
-        residuals[i] = measured - predicted
-        nis[i] = residuals[i] ** 2 / belief.spread(H, R).item()
-        verdicts[i], factor = gate.judge(candidates, i, residuals[i], nis[i])
-        if verdicts[i].is_used:
-            belief.correct(residuals[i : i + 1], H, factor**2 * R)
-            believed.append((numbers[anchor_ids[i]], measured, factor * sigma))
-    return Report(tuple(verdicts), residuals, nis), _range_rows(believed, arm)
+    report, _, _ = gate.judge_at(candidates, belief.cov, arm)
+    return report, believed_ranges(candidates, arm, weighed=True)
 
 
-def believed_ranges(judged: Candidates, arm: FloatArray) -> FloatArray:
-    """Ranges that a filter accepted as rows of `factors.ranges`, whose pose is not known yet.
-
-    Those that it weighed down are not among them.
+def believed_ranges(judged: Candidates, arm: FloatArray, *, weighed: bool) -> FloatArray:
+    """Ranges that a gate lets pass as rows of `factors.ranges`, whose pose is not known yet.
 
     Args:
-        judged: by the filter's gate, together.
+        judged: by the gate, together.
         arm: (3,) tag antenna in the body frame [m].
+        weighed: those that count less are among them.
     """
-    return factor_rows.ranges(judged.anchors, judged.rows, judged.codes, ACCEPTED, *arm[:2].tolist())
+    least = DOWNWEIGHTED if weighed else ACCEPTED
+    return factor_rows.ranges(judged.anchors, judged.rows, judged.codes, least, *arm[:2].tolist())
 
 
 def judge_landmarks(
@@ -124,10 +109,3 @@ def judge_landmarks(
     if not rows:
         return Verdict.GATED, np.empty((0, factors.SIGHTING))
     return Verdict.ACCEPTED, factors.sightings(-1, *np.array(rows).T)
-
-
-def _range_rows(believed: Sequence[tuple[int, float, float]], arm: FloatArray) -> FloatArray:
-    """Rows of `factors.ranges` from variables of anchors, horizontal ranges and their sigmas [m]."""
-    arm_xy = arm[:2].tolist()
-    rows = [factors.horizontal_range(*item, *arm_xy) for item in believed]
-    return np.array(rows, dtype=np.float64).reshape(-1, factors.RANGE)

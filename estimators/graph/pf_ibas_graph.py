@@ -54,7 +54,7 @@ class PfIbasGraph(GraphSmoother):
         judged = self._filter.judged
         if judged is None or judged.frame is not frame:
             return super()._judge_newest(frame)
-        rows = self._judging.believed_ranges(judged, self._setup.arm(frame.tag_id))
+        rows = self._judging.believed_ranges(judged, self._setup.arm(frame.tag_id), weighed=False)
         return self._taken(frame.stamp_ns, "ranges", rows, self._said)
 
     def _guess(self, stamp_ns: int) -> FloatArray:

@@ -73,7 +73,6 @@ class GraphSmoother(KeyframeTracker):
         self._most_places = config.places
         self._gate = RangeGate(config, setup)
         self._landmark_gate = LandmarkGate(config, setup)
-        self._anchor_numbers = {anchor_id: i for i, anchor_id in enumerate(setup.anchors)}
         self._landmark_numbers = {
             (float(x), float(y)): len(setup.anchors) + k for k, (x, y) in enumerate(setup.landmarks.values())
         }
@@ -177,7 +176,7 @@ class GraphSmoother(KeyframeTracker):
         belief = self._judging.Belief(mean[STATE], cov[STATE, STATE])
         if isinstance(frame, RangeFrame):
             report, rows = self._judging.judge_ranges(
-                self._gate, frame, belief, self._setup.arm(frame.tag_id), self._anchor_numbers
+                self._gate, frame, belief, self._setup.arm(frame.tag_id)
             )
             table = "ranges"
         else:

@@ -15,21 +15,21 @@ _KIND, _SCALE = float(GAUSSIAN.kind), GAUSSIAN.scale
 
 @compiled(f"{MATRIX}({INDICES}, {MATRIX}, {INDICES}, int64, float64, float64)")
 def ranges(
-    anchors: IntArray, reduced: FloatArray, codes: IntArray, wanted: int, arm_x: float, arm_y: float
+    anchors: IntArray, reduced: FloatArray, codes: IntArray, least: int, arm_x: float, arm_y: float
 ) -> FloatArray:
-    """Rows (M, 9) of those of N ranges in the plane that got one of the verdicts.
+    """Rows (M, 9) of those of N ranges in the plane that passed their gate.
 
     Args:
         anchors: (N,) variables.
-        reduced: (N, 4) as of `range_gate.reduce_heights`.
-        codes: (N,) verdicts.
-        wanted: the verdict.
+        reduced: (N, 4) of `range_gate.reduce_heights`, with the sigmas of `range_gate.judge_together`.
+        codes: (N,) verdicts of `range_gate`; those that pass are the first.
+        least: the last that does.
         arm_x: tag antenna in the body frame [m].
         arm_y: likewise.
     """
     rows, count = np.zeros((len(codes), RANGE)), 0
     for k in range(len(codes)):
-        if codes[k] == wanted:
+        if 0 <= codes[k] <= least:
             row = rows[count]
             row[0], row[1], row[2], row[3] = -1.0, anchors[k], reduced[k, 2], reduced[k, 3]
             row[4], row[5], row[7], row[8] = arm_x, arm_y, _KIND, _SCALE

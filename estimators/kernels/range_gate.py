@@ -7,7 +7,7 @@ look along the line of sight, 0 when nobody looks; whether residuals count, powe
 are weighed instead of rejected.
 """
 
-from math import isfinite, isnan, sqrt
+from math import cos, hypot, isfinite, isnan, sin, sqrt
 from typing import TypeAlias
 
 import numpy as np
@@ -24,7 +24,7 @@ from estimators.kernels.blocked import (
 )
 from estimators.kernels.compilation import INDICES, MATRIX, VECTOR, compiled
 from estimators.messages import FloatArray, IntArray
-from estimators.models.range import MIN_HORIZONTAL_RANGE
+from estimators.models.range import MIN_HORIZONTAL_RANGE, NOWHERE
 
 State: TypeAlias = tuple[IntArray, FloatArray, FloatArray, IntArray, IntArray]
 Settings: TypeAlias = tuple[float, float, float, float, float, bool, bool, bool]
@@ -89,6 +89,56 @@ def reduce_heights(
                     rows[i, 2] = sqrt(square)
                     rows[i, 3] = sigma * slants[i] / rows[i, 2]
                 break
+
+
+@compiled(
+    f"Tuple(({VECTOR}, {MATRIX}, {MATRIX}))"
+    f"({INDICES}, {MATRIX}, {MATRIX}, {VECTOR}, {MATRIX}, float64, float64)"
+)
+def expected_at(
+    anchors: IntArray,
+    rows: FloatArray,
+    bias_by_pose: FloatArray,
+    pose: FloatArray,
+    cov: FloatArray,
+    arm_x: float,
+    arm_y: float,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Ranges against those predicted by `models.range.horizontal_range` for a pose and its covariance.
+
+    Args:
+        anchors: (N,) of `reduce_heights`.
+        rows: (N, 4) likewise.
+        bias_by_pose: (N, 3) derivative by the pose of what was taken off the ranges.
+        pose: (3,) x [m], y [m], yaw [rad] of the body in the map.
+        cov: (N, N) beginning with that of the pose.
+        arm_x: tag antenna in the body frame [m].
+        arm_y: likewise.
+
+    Returns:
+        Measured minus predicted (N,) [m]; derivative of what is predicted by the pose (N, 3); its covariance
+        (N, N) [m^2]. Zero where something is wrong with a range.
+    """
+    count = len(anchors)
+    residuals, by_pose, spread = np.zeros(count), np.zeros((count, 3)), np.zeros((count, count))
+    c, s = cos(pose[2]), sin(pose[2])
+    x, y = c * arm_x - s * arm_y, s * arm_x + c * arm_y
+    for i in range(count):
+        if anchors[i] < 0:
+            continue
+        dx, dy = pose[0] + x - rows[i, 0], pose[1] + y - rows[i, 1]
+        distance = max(hypot(dx, dy), NOWHERE)
+        residuals[i] = rows[i, 2] - distance
+        ux, uy = dx / distance, dy / distance
+        by_pose[i, 0], by_pose[i, 1], by_pose[i, 2] = ux, uy, uy * x - ux * y
+        for a in range(3):
+            by_pose[i, a] += bias_by_pose[i, a]
+        for k in range(i + 1):
+            for a in range(3):
+                for b in range(3):
+                    spread[i, k] += by_pose[i, a] * cov[a, b] * by_pose[k, b]
+            spread[k, i] = spread[i, k]
+    return residuals, by_pose, spread
 
 
 @compiled("int64(float64, float64, float64)")

@@ -10,6 +10,8 @@ SPEED_OF_LIGHT = 299_792_458.0
 """[m/s]."""
 MIN_HORIZONTAL_RANGE = 0.05
 """Below this [m] the tag stands under the anchor: the horizontal range has no usable direction."""
+NOWHERE = 1e-9
+"""Least distance [m] that a direction is computed with."""
 
 
 def two_way_range(
@@ -76,7 +78,7 @@ def horizontal_range(
     arm_y = s * lever_arm[0] + c * lever_arm[1]
     dx = pose[0] + arm_x - anchor[0]
     dy = pose[1] + arm_y - anchor[1]
-    distance = max(hypot(dx, dy), 1e-9)
+    distance = max(hypot(dx, dy), NOWHERE)
     ux, uy = dx / distance, dy / distance
     return distance, np.array([ux, uy, uy * arm_x - ux * arm_y])
 

@@ -25,6 +25,7 @@ CLEAR, WEAK, NO_POWER = 3.0, 11.0, np.nan
 """Power of everything received above that of the first path [dB]."""
 EXPECTED_SIGMA = 0.11
 """Of a residual: the range's and the prediction's [m]."""
+COLUMNS = ("anchor_ids", "ranges", "rx_power", "fp_power")
 
 
 def gate(*methods: NlosMethod) -> RangeGate:
@@ -40,9 +41,26 @@ def frame_at(k: int, excess: FloatArray, difference: float | FloatArray = NO_POW
 
 def judged(of: RangeGate, k: int, residual: float, difference: float = NO_POWER) -> Verdict:
     """Verdict on the first range of a frame."""
-    candidates = of.horizontal.of(frame_at(k, np.zeros(4), difference), POSE, 0.0)
-    verdict, _ = of.judge(candidates, 0, residual, (residual / EXPECTED_SIGMA) ** 2)
-    return verdict
+    return judged_alone(of, first_of(frame_at(k, np.zeros(4), difference)), residual)[0]
+
+
+def first_of(frame: RangeFrame) -> RangeFrame:
+    """Only the first range."""
+    return replace(frame, **{name: getattr(frame, name)[:1] for name in COLUMNS})
+
+
+def judged_alone(
+    of: RangeGate, frame: RangeFrame, residual: float, variance: float | None = None
+) -> tuple[Verdict, float]:
+    """Verdict on the only range of a frame, and the factor of its sigma.
+
+    `variance` is that of the prediction; without it, the residual is expected with `EXPECTED_SIGMA`.
+    """
+    candidates = of.horizontal.of(frame, POSE, 0.0)
+    sigma = float(candidates.rows[0, 3])
+    spread = EXPECTED_SIGMA**2 - sigma**2 if variance is None else variance
+    report = of.judge_together(candidates, np.array([residual]), np.array([[spread]]))
+    return report.verdicts[0], float(candidates.rows[0, 3] / sigma)
 
 
 def obstruct(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -149,8 +167,7 @@ def test_robust_uses_every_range_that_is_not_too_short_but_counts_the_long_ones_
     soft = gate("robust")
     factors = []
     for k, residual in enumerate((0.0, 0.2, 0.4, 2.0)):
-        candidates = soft.horizontal.of(frame_at(k, np.zeros(4)), POSE, 0.0)
-        verdict, factor = soft.judge(candidates, 0, residual, (residual / EXPECTED_SIGMA) ** 2)
+        verdict, factor = judged_alone(soft, first_of(frame_at(k, np.zeros(4))), residual)
         assert verdict is (Verdict.DOWNWEIGHTED if residual >= 0.4 else Verdict.ACCEPTED)
         factors.append(factor)
     assert factors == sorted(factors)
@@ -216,7 +233,8 @@ def test_what_is_judged_together_is_judged_as_by_a_kalman_filter_one_by_one(
             H, sigma = np.eye(4)[i], singles.rows[i, 3]
             residual = mean[i] - state[i]
             nis = residual**2 / (spread[i, i] + sigma**2)
-            expected, factor = alone.judge(singles, i, residual, nis)
+            one = {name: getattr(frame, name)[i : i + 1] for name in COLUMNS}
+            expected, factor = judged_alone(alone, replace(frame, **one), residual, spread[i, i])
             given.add(expected)
             assert report.verdicts[i] is expected
             assert report.residuals[i] == pytest.approx(residual, abs=1e-12)
