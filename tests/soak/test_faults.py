@@ -1,4 +1,4 @@
-"""A short soak; `python tests/soak/faults.py` walks for an hour."""
+"""A short soak; `python -m tests.soak.faults` walks for an hour."""
 
 from pathlib import Path
 
