@@ -156,9 +156,10 @@ def run(
     Missing ports and a missing autopilot are waited for, and taken up again after an unplug. A pose is only
     sent while its health is ok or degraded.
     """
-    from companion.config import load_config, named_file
+    from companion.config import load_config
     from companion.live import LiveRun
     from companion.mavlink.parameters import saved_settings
+    from companion.shipped_files import named_file
 
     assignments = [*(sets or []), *([f"mavlink.url={mavlink}"] if mavlink is not None else [])]
     config = load_config(named_file(site, "sites"), assignments)
@@ -267,10 +268,11 @@ def replay(
     The same log and settings give the same poses, byte for byte. The settings are those stored in the log;
     change them with --set, or give a corrected site file with --site.
     """
-    from companion.config import load_config, named_file
+    from companion.config import load_config
     from companion.log import Log
     from companion.replay import config_of, write_outputs
     from companion.replay import replay as run_log
+    from companion.shipped_files import named_file
     from companion.tables import accuracy_table, anchor_table, sensor_lines
     from companion.view.files import RerunFiles
     from estimators import ESTIMATORS
@@ -341,9 +343,10 @@ def plan(
     Walls and furniture block ranges, and a blocked range does not count. The error is the least that a single
     frame of ranges allows (Cramer-Rao): a filter with a LiDAR does better, nothing without memory does.
     """
-    from companion.config import load_config, named_file
+    from companion.config import load_config
     from companion.plan import plan_layout
     from companion.plan_plot import plan_figure
+    from companion.shipped_files import named_file
     from companion.sim.scenario import load_scenario
 
     config = load_config(named_file(site, "sites"), sets or [])
@@ -363,7 +366,8 @@ def dump_config(
     sets: Sets = None,
 ) -> None:
     """Print every setting with its default, or a site's whole configuration, as TOML."""
-    from companion.config import default_toml, load_config, named_file
+    from companion.config import default_toml, load_config
+    from companion.shipped_files import named_file
 
     if site is None:
         if sets:
@@ -408,7 +412,7 @@ def _shown(view: str) -> "Shown":
 
 
 def _scenario_path(name: str) -> Path:
-    from companion.config import named_file
+    from companion.shipped_files import named_file
 
     return named_file(Path(name), "scenarios")
 

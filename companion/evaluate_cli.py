@@ -91,10 +91,10 @@ def scenario(
     excepted. Where the scenario holds figures of a paper, they stand below ours. Ctrl-C ends it and keeps
     the trials that are done (exit code 1).
     """
-    from companion.config import named_file
     from companion.evaluation import DEFAULT_CHOICES, evaluate_scenario
     from companion.fault_table import fault_table
     from companion.log_trial import LOG_SUFFIX
+    from companion.shipped_files import named_file
 
     out, err = result_console(), message_console()
     if not out.is_terminal:

@@ -104,8 +104,8 @@ def import_recording(
     Ranges become LinkTrack frames, scans RPLIDAR packets: replay and evaluate take the one path that a
     robot takes.
     """
-    from companion.config import named_file
     from companion.importers.sources import import_log
+    from companion.shipped_files import named_file
 
     count = import_log(source, path, site and named_file(site, "sites"), sets, truth)
     result_console().print(f"{path}  {count} measurements", soft_wrap=True)

@@ -16,7 +16,8 @@ from pathlib import Path
 import numpy as np
 
 from companion.autopilot_client import AutopilotClient
-from companion.config import Config, OriginTable
+from companion.config import Config
+from companion.config_tables import OriginTable
 from companion.errors import UserError
 from companion.follow import RATES, FollowScore
 from companion.live import LiveRun

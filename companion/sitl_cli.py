@@ -46,7 +46,7 @@ def sitl(
     """
     import numpy as np
 
-    from companion.config import named_file
+    from companion.shipped_files import named_file
     from companion.sim.scenario import load_scenario
     from companion.sitl import SitlRun
 

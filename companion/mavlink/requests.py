@@ -8,7 +8,7 @@ from math import cos, hypot, radians
 
 from pymavlink.dialects.v20 import all as mavlink2
 
-from companion.config import OriginTable
+from companion.config_tables import OriginTable
 from companion.mavlink_table import MavlinkTable
 from drivers.mavlink_frames import MavlinkMessage
 

@@ -4,11 +4,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from companion.config import Config, params_dir
+from companion.config import Config
 from companion.log import RawChunk
 from companion.mavlink.link import NAME
 from companion.mavlink.session import MavlinkSession
 from companion.pipeline import Chain, Tick, make_pipeline
+from companion.shipped_files import params_dir
 from companion.sim.autopilot import EmulatedAutopilot
 from companion.sim.scenario import Scenario
 from companion.sim.simulate import START_NS, converse

@@ -10,7 +10,7 @@ from statistics import fmean
 
 import numpy as np
 
-from companion.config import params_dir
+from companion.shipped_files import params_dir
 from companion.sim.measurements import measure as measured_walk
 from companion.sim.measurements import setup_of
 from companion.sim.scenario import load_scenario
