@@ -13,6 +13,7 @@ import typer
 
 from companion.alignment import Alignment
 from companion.errors import UserError
+from companion.shipped_files import named_file
 from companion.terminal import Seed, Sets, message_console, progress, result_console
 
 if TYPE_CHECKING:
@@ -94,7 +95,6 @@ def scenario(
     from companion.evaluation import DEFAULT_CHOICES, evaluate_scenario
     from companion.fault_table import fault_table
     from companion.log_trial import LOG_SUFFIX
-    from companion.shipped_files import named_file
 
     out, err = result_console(), message_console()
     if not out.is_terminal:

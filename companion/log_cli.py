@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from companion.errors import UserError
+from companion.shipped_files import named_file
 from companion.terminal import Seed, Sets, message_console, progress, result_console
 
 
@@ -105,7 +106,6 @@ def import_recording(
     robot takes.
     """
     from companion.importers.sources import import_log
-    from companion.shipped_files import named_file
 
     count = import_log(source, path, site and named_file(site, "sites"), sets, truth)
     result_console().print(f"{path}  {count} measurements", soft_wrap=True)
