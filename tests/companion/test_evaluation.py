@@ -19,7 +19,8 @@ from companion.log import Log
 from companion.replay import config_of, replay
 from companion.shipped_files import params_dir
 from companion.sim.scenario import load_scenario
-from companion.trial import TrialFigures, run_trial
+from companion.trial import run_trial
+from companion.trial_figures import TrialFigures
 from tests.conftest import SITE, Command, write_log, write_scenario
 
 STRAIGHT_ON = "[trajectory]\nwaypoints = [[1.5, 1.2], [3.5, 1.2]]\nlaps = 0\nrest = 1.0\n"
