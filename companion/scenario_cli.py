@@ -40,6 +40,7 @@ def demo(
     from companion.demo import run_demo
     from companion.tables import accuracy_table, anchor_table, sensor_lines
 
+    where = shown_where(view)
     loaded = _load_scenario(scenario, seed, sets)
     with progress(err) as shown:
         bars = {name: shown.add_task(name, total=1.0) for name in ("walk", "replay", "pictures")}
@@ -62,7 +63,6 @@ def demo(
     out.print(f"  picture  {folder / 'demo.png'}")
     out.print(f"  log      {folder / 'raw.mcap'}")
     out.print(f"  review   companion review {folder}")
-    where = shown_where(view)
     if where != "off":
         from companion.view.viewer import Viewer
 
@@ -101,8 +101,8 @@ def emulate(scenario: Scenario_, seed: Seed = None, view: View = "off", sets: Se
     """
     from companion.sim.emulate import Emulator
 
-    loaded = _load_scenario(scenario, seed, sets)
     where = shown_where(view)
+    loaded = _load_scenario(scenario, seed, sets)
     with ExitStack() as closing:
         stop = closing.enter_context(set_by_signals())
         emulator = Emulator(loaded)

@@ -43,7 +43,7 @@ def import_log(
         if name is None:
             raise UserError(f"{source}: give --site FILE, the recording does not say where its anchors stand")
         site = params_dir() / "sites" / f"{name}.toml"
-    config: Config = load_config(site, sets or [])
+    config = load_config(site, sets or [])
     return write_recording(_read(source, name, config, truth), config, path)
 
 

@@ -8,6 +8,9 @@ from scipy.spatial.transform import Rotation
 from estimators.geometry import wrap_angle
 from estimators.messages import FloatArray, PoseEstimate
 
+METRES_PER_DEGREE = 111_319.5
+"""Length of a degree of latitude, and of one of longitude at the equator."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NedPose:
