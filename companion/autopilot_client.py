@@ -148,10 +148,16 @@ class AutopilotClient:
             if time.monotonic() >= self._greet_at:
                 # Without a word from us an autopilot behind UDP does not know where we are.
                 self._greet_at = time.monotonic() + 1.0
-                beat = mavlink2.MAVLink_heartbeat_message(18, mavlink2.MAV_AUTOPILOT_INVALID, 0, 0, 4, 3)
+                beat = mavlink2.MAVLink_heartbeat_message(
+                    mavlink2.MAV_TYPE_ONBOARD_CONTROLLER,
+                    mavlink2.MAV_AUTOPILOT_INVALID,
+                    0,
+                    0,
+                    mavlink2.MAV_STATE_ACTIVE,
+                    3,
+                )
                 self._end.send(beat, self._identity.system or 1)
-                data = self._end.take()
-                self._try_write(data)
+                self._try_write(self._end.take())
             try:
                 data = self._wire.read()
             except OSError as error:

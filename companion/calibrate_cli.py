@@ -9,6 +9,7 @@ from rich import box
 from rich.table import Table
 
 from companion.errors import UserError
+from companion.shipped_files import named_file
 from companion.terminal import message_console, result_console
 
 if TYPE_CHECKING:
@@ -149,7 +150,7 @@ def mounting(log: Log_, site: Site, until: Until = None, figures: Json = None) -
     from companion.config import load_config
     from companion.log import Log
 
-    config = load_config(site)
+    config = load_config(named_file(site, "sites"))
     found = mounting_on_drive(read_recording(Log(log), config, until, with_odometry=True), config)
     table = Table(title=f"{config.site.name}: UWB tag against LiDAR", title_justify="left")
     for heading in ("", "site", "found", "sigma", "unit"):

@@ -21,8 +21,6 @@ NOTHING_THERE = """no serial port found. Check:
 app = typer.Typer(
     help="Find out what is wrong with the hardware.", no_args_is_help=True, rich_markup_mode="rich"
 )
-
-
 app.command()(frames)
 
 

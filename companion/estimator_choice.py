@@ -2,7 +2,8 @@
 
 from pydantic import BaseModel
 
-from companion.config import Config, validated
+from companion.checked_toml import validated
+from companion.config import Config
 from companion.errors import UserError
 
 

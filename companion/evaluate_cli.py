@@ -13,6 +13,7 @@ import typer
 
 from companion.alignment import Alignment
 from companion.errors import UserError
+from companion.shipped_files import named_file
 from companion.terminal import Seed, Sets, message_console, progress, result_console
 
 if TYPE_CHECKING:
@@ -91,7 +92,6 @@ def scenario(
     excepted. Where the scenario holds figures of a paper, they stand below ours. Ctrl-C ends it and keeps
     the trials that are done (exit code 1).
     """
-    from companion.config import named_file
     from companion.evaluation import DEFAULT_CHOICES, evaluate_scenario
     from companion.fault_table import fault_table
     from companion.log_trial import LOG_SUFFIX

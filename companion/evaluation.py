@@ -26,8 +26,10 @@ from companion.metrics import chi2_mean_bounds
 from companion.range_score import pooled
 from companion.sim.scenario import load_scenario
 from companion.sim.scenario_tables import PaperTable
-from companion.trial import LIDAR_ALONE, UWB_ALONE, TrialFigures, run_trial
+from companion.trial import run_trial
+from companion.trial_figures import TrialFigures
 from companion.trial_runner import run_trials
+from companion.watched_choices import LIDAR_ALONE, UWB_ALONE
 from estimators import ESTIMATORS
 
 DEFAULT_CHOICES = (UWB_ALONE, LIDAR_ALONE, "ekf")

@@ -15,7 +15,7 @@ from companion.log_trial import LOG_SUFFIX, run_records
 from companion.replay import config_of
 from companion.sim.scenario import load_scenario
 from companion.sim.simulate import START_NS, records
-from companion.trial import TrialFigures
+from companion.trial_figures import TrialFigures
 
 
 def run_fault_trial(

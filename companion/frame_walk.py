@@ -8,10 +8,11 @@ import numpy as np
 from rich.console import Console
 from rich.markup import escape
 
-from companion.config import load_config, named_file
+from companion.config import load_config
 from companion.errors import UserError
 from companion.live import LiveRun
 from companion.mavlink.contact import Watch
+from companion.shipped_files import named_file
 from drivers.mavlink_frames import MavlinkMessage
 from estimators.messages import FloatArray
 

@@ -7,7 +7,7 @@ from math import degrees, exp, hypot, inf, sqrt
 
 import numpy as np
 
-from companion.config import HealthTable
+from companion.config_tables import HealthTable
 from estimators.base import Report, Verdict
 from estimators.immutable import immutable
 from estimators.messages import (

@@ -10,7 +10,8 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from companion.config import Config, SensorTable
+from companion.config import Config
+from companion.config_tables import SensorTable
 from companion.errors import UserError
 from companion.health import Health, uwb_line
 from companion.log import Direction, LogWriter, RawChunk

@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from companion.errors import UserError
+from companion.shipped_files import named_file
 from companion.terminal import Seed, Sets, message_console, progress, result_console
 
 
@@ -104,7 +105,6 @@ def import_recording(
     Ranges become LinkTrack frames, scans RPLIDAR packets: replay and evaluate take the one path that a
     robot takes.
     """
-    from companion.config import named_file
     from companion.importers.sources import import_log
 
     count = import_log(source, path, site and named_file(site, "sites"), sets, truth)

@@ -12,7 +12,8 @@ from companion.evaluate import Reference, compare
 from companion.log import Log, RawChunk, Truth
 from companion.pipeline import Chain
 from companion.replay import config_of
-from companion.trial import TrialFigures, note_poses, trial_figures, watched_choices, watched_pipeline
+from companion.trial_figures import TrialFigures, trial_figures
+from companion.watched_choices import note_poses, watched_choices, watched_pipeline
 from estimators.messages import PoseEstimate
 
 LOG_SUFFIX = ".mcap"

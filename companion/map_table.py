@@ -7,8 +7,9 @@ from math import hypot
 from typing import Annotated, Self
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
+from companion.checked_toml import Table
 from estimators.lidar.floor_map import FloorMap
 
 MOST_CELLS = 4_000_000
@@ -20,10 +21,8 @@ _OCCUPIED, _FREE = 1, 2
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 
-class MapTable(BaseModel):
+class MapTable(Table):
     """Cells of a map; a site file names the map's file instead, `map = "room.yaml"`."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     name: str = Field(description="file that it was read from")
     cell: float = Field(gt=0, le=10, description="side of a cell [m]")

@@ -2,15 +2,14 @@
 
 from typing import Annotated, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
+from companion.checked_toml import Table
 from drivers.autopilot import Autopilot
 
 
-class GateTable(BaseModel):
+class GateTable(Table):
     """When poses are sent: on top of `[health]`, what an autopilot needs of a stream."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     resume_after: float = Field(
         1.0,
@@ -26,10 +25,8 @@ class GateTable(BaseModel):
     max_jump_deg: float = Field(15.0, gt=0, le=180, description="the same of the heading [deg]")
 
 
-class MavlinkTable(BaseModel):
+class MavlinkTable(Table):
     """Links to the autopilot and a ground station, and what is said there."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     url: str = Field(
         "udpout:127.0.0.1:14550",

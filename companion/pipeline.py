@@ -12,7 +12,8 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from companion.config import Config, HealthTable
+from companion.config import Config
+from companion.config_tables import HealthTable
 from companion.health import AnchorState, Health, HealthMonitor
 from companion.log import Direction, RawChunk
 from companion.look_back import LookBack, make_look_back

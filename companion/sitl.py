@@ -16,12 +16,13 @@ from pathlib import Path
 import numpy as np
 
 from companion.autopilot_client import AutopilotClient
-from companion.config import Config, OriginTable
+from companion.config import Config
+from companion.config_tables import OriginTable
 from companion.errors import UserError
 from companion.follow import RATES, FollowScore
 from companion.live import LiveRun
 from companion.mavlink.contact import Watch
-from companion.mavlink.pose_out import ned_from_map
+from companion.mavlink.pose_out import METRES_PER_DEGREE, ned_from_map
 from companion.sim.emulate import Emulator
 from companion.sim.followed import FollowedTrajectory
 from companion.sim.scenario import Scenario
@@ -32,7 +33,6 @@ from estimators.messages import FloatArray
 
 TRUTH = "SIMSTATE"
 TRUTH_RATE = 50.0
-_METRES_PER_DEGREE = 111_319.5
 
 
 @immutable
@@ -51,8 +51,8 @@ class Placement:
 
     def map_pose(self, truth: MavlinkMessage) -> FloatArray:
         """Pose (3,) in the map of a vehicle that is where SIMSTATE says."""
-        north = (truth.lat / 1e7 - self.lat) * _METRES_PER_DEGREE
-        east = (truth.lng / 1e7 - self.lon) * _METRES_PER_DEGREE * cos(radians(self.lat))
+        north = (truth.lat / 1e7 - self.lat) * METRES_PER_DEGREE
+        east = (truth.lng / 1e7 - self.lon) * METRES_PER_DEGREE * cos(radians(self.lat))
         xy = ned_from_map(self.heading)[:2, :2].T @ np.array([north, east])
         return np.array([xy[0], xy[1], wrap_angle(self.heading - truth.yaw)])
 
@@ -66,8 +66,8 @@ def place(truth: MavlinkMessage, start: FloatArray) -> Placement:
     """
     heading = wrap_angle(float(start[2]) + truth.yaw)
     north, east = ned_from_map(heading)[:2, :2] @ start[:2]
-    lat = truth.lat / 1e7 - north / _METRES_PER_DEGREE
-    lon = truth.lng / 1e7 - east / (_METRES_PER_DEGREE * cos(radians(lat)))
+    lat = truth.lat / 1e7 - north / METRES_PER_DEGREE
+    lon = truth.lng / 1e7 - east / (METRES_PER_DEGREE * cos(radians(lat)))
     return Placement(lat, lon, heading)
 
 

@@ -10,6 +10,7 @@ import typer
 from rich.markup import escape
 
 from companion.interrupt import set_by_signals
+from companion.shipped_files import named_file
 from companion.terminal import message_console, result_console
 
 EXIT_NOT_FOLLOWED = 1
@@ -46,7 +47,6 @@ def sitl(
     """
     import numpy as np
 
-    from companion.config import named_file
     from companion.sim.scenario import load_scenario
     from companion.sitl import SitlRun
 

@@ -95,7 +95,7 @@ def smooth_log(
     yaw_variance = float(np.median([pose.planar_cov[2, 2] for pose in track]))
     measurements = _without_bearing_biases(measurements, setup, guess, yaw_variance)
     try:
-        recording = Recording(measurements, setup, noise, setup.tags)
+        recording = Recording(measurements, setup, noise)
         smoothed = smooth(
             recording,
             guess,

@@ -8,6 +8,7 @@ import typer
 from rich.table import Table
 
 from companion.errors import UserError
+from companion.shipped_files import named_file
 from companion.terminal import Sets, message_console, progress, result_console
 
 if TYPE_CHECKING:
@@ -45,7 +46,7 @@ def smooth(
 
     out, err = result_console(), message_console()
     opened = Log(log)
-    config = load_config(site, sets or []) if site else config_of(opened, sets or [])
+    config = load_config(named_file(site, "sites"), sets or []) if site else config_of(opened, sets or [])
     folder = folder or Path("out") / f"{log.stem}-smooth"
     with progress(err) as shown:
         bar = shown.add_task(log.name, total=1.0)

@@ -1,6 +1,6 @@
-"""What the commands write with: results to stdout; progress and messages to stderr."""
+"""What the commands share: results go to stdout, progress and messages to stderr; options of several."""
 
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
@@ -13,6 +13,11 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+from companion.errors import UserError
+
+if TYPE_CHECKING:
+    from companion.view.viewer import Shown
+
 Seed = Annotated[
     int | None, typer.Option("--seed", min=0, metavar="N", help="Instead of the scenario's own seed.")
 ]
@@ -22,6 +27,15 @@ Sets = Annotated[
         "--set",
         metavar="KEY=VALUE",
         help="Change one setting of the site, e.g. --set pipeline.rate=20. Repeatable.",
+    ),
+]
+View = Annotated[
+    str,
+    typer.Option(
+        "--view",
+        metavar="WHERE",
+        help="Show it in Rerun: web (a page for a browser, see the table view), native (a window on this "
+        "computer) or off. `run` and `emulate` show it while it runs.",
     ),
 ]
 
@@ -52,3 +66,15 @@ def progress(console: Console, *, counts: bool = False) -> Progress:
         transient=True,
         disable=not console.is_terminal,
     )
+
+
+def shown_where(view: str) -> "Shown":
+    """The value of `--view`.
+
+    Raises:
+        UserError: it is none of those there are.
+    """
+    match view:
+        case "web" | "native" | "off":
+            return view
+    raise UserError(f"--view: {view!r} is none of web, native, off")

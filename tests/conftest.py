@@ -10,7 +10,8 @@ import pytest
 from hypothesis import HealthCheck, settings
 
 from companion.cli import main
-from companion.config import Config, load_config, params_dir
+from companion.config import Config, load_config
+from companion.shipped_files import params_dir
 from companion.sim.scenario import Scenario, load_scenario
 from companion.sim.simulate import simulate
 

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import tomlkit
-from tomlkit.items import Table
+from tomlkit.items import InlineTable
 
 from companion.calibration.bearings import BearingFit
 from companion.calibration.ranges import Calibration
@@ -71,5 +71,9 @@ def write_range_bias(
 def _table(parent: Any, name: str) -> Any:
     if name not in parent:
         parent[name] = tomlkit.table()
-    assert isinstance(parent[name], Table)
+    elif isinstance(parent[name], InlineTable):
+        # One line has no room for what a calibration tells.
+        whole = tomlkit.table()
+        whole.update(parent[name].unwrap())
+        parent[name] = whole
     return parent[name]

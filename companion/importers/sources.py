@@ -2,13 +2,14 @@
 
 from pathlib import Path
 
-from companion.config import Config, load_config, params_dir
+from companion.config import Config, load_config
 from companion.errors import UserError
 from companion.importers.carmen import read_carmen
 from companion.importers.data_sets import DATA_SETS, data_set_in
 from companion.importers.recording import Recording, write_recording
 from companion.importers.ros import read_bag
 from companion.importers.text_folder import INERTIAL, RANGES, SCANS, read_folder
+from companion.shipped_files import params_dir
 
 _CARMEN = (".log", ".clf")
 _BAGS = (".bag", ".mcap", ".db3")
@@ -42,7 +43,7 @@ def import_log(
         if name is None:
             raise UserError(f"{source}: give --site FILE, the recording does not say where its anchors stand")
         site = params_dir() / "sites" / f"{name}.toml"
-    config: Config = load_config(site, sets or [])
+    config = load_config(site, sets or [])
     return write_recording(_read(source, name, config, truth), config, path)
 
 

@@ -11,7 +11,9 @@ from typing import Annotated, ClassVar
 import numpy as np
 from pydantic import Field
 
-from companion.config import Config, Coordinate, Table, validated
+from companion.checked_toml import Table, validated
+from companion.config import Config
+from companion.config_tables import Coordinate
 from companion.errors import UserError
 from companion.log import RawChunk
 from companion.log_edit.ranges import Changed, change_ranges

@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from companion.config import params_dir
 from companion.errors import UserError
+from companion.shipped_files import params_dir
 from companion.text_file import read_text
 
 FOLDERS = {"ardupilot": ".parm", "px4": ".params"}

@@ -7,6 +7,9 @@ from estimators.geometry import wrap_angle
 from estimators.immutable import immutable
 from estimators.messages import FloatArray, PoseEstimate
 
+METRES_PER_DEGREE = 111_319.5
+"""Length of a degree of latitude, and of one of longitude at the equator."""
+
 
 @immutable
 class NedPose:

@@ -9,12 +9,11 @@ import numpy as np
 from pymavlink.dialects.v20 import all as mavlink2
 
 from companion.config import Config
-from companion.mavlink.pose_out import ned_from_map
+from companion.mavlink.pose_out import METRES_PER_DEGREE, ned_from_map
 from drivers.mavlink_frames import MavlinkMessage
 from estimators.base import Report, Verdict
 from estimators.messages import RangeFrame
 
-_METRES_PER_DEGREE = 111_319.5
 _UNKNOWN = 2**32 - 1
 
 
@@ -35,8 +34,8 @@ class RangingBeacons:
         self._anchors: dict[int, tuple[int, int, float]] = {}
         for number, position in config.anchors.items():
             north, east, down = R_ned_map @ np.array(position)
-            lat = origin.lat + north / _METRES_PER_DEGREE
-            lon = origin.lon + east / (_METRES_PER_DEGREE * cos(radians(origin.lat)))
+            lat = origin.lat + north / METRES_PER_DEGREE
+            lon = origin.lon + east / (METRES_PER_DEGREE * cos(radians(origin.lat)))
             self._anchors[number] = round(lat * 1e7), round(lon * 1e7), origin.alt - float(down)
 
     def messages(self, frame: RangeFrame, report: Report, system: int) -> list[MavlinkMessage]:

@@ -8,7 +8,8 @@ from math import cos, hypot, radians
 
 from pymavlink.dialects.v20 import all as mavlink2
 
-from companion.config import OriginTable
+from companion.config_tables import OriginTable
+from companion.mavlink.pose_out import METRES_PER_DEGREE
 from companion.mavlink_table import MavlinkTable
 from drivers.mavlink_frames import MavlinkMessage
 
@@ -18,7 +19,6 @@ SAME_ORIGIN = 1.0
 """An origin that is no farther away is ours [m]: degE7 and float32 round."""
 COMPASS_RATE = 10.0
 """ATTITUDE for the alignment to the compass [Hz]."""
-_METRES_PER_DEGREE = 111_319.5
 
 
 class OriginKeeper:
@@ -53,8 +53,8 @@ class OriginKeeper:
         if self._table is None or message.get_type() != "GPS_GLOBAL_ORIGIN":
             return
         if message.latitude or message.longitude:
-            north = (message.latitude / 1e7 - self._table.lat) * _METRES_PER_DEGREE
-            east = (message.longitude / 1e7 - self._table.lon) * _METRES_PER_DEGREE
+            north = (message.latitude / 1e7 - self._table.lat) * METRES_PER_DEGREE
+            east = (message.longitude / 1e7 - self._table.lon) * METRES_PER_DEGREE
             self.distance = hypot(north, east * cos(radians(self._table.lat)))
             self.confirmed = True
 

@@ -6,7 +6,7 @@ from collections import deque
 import numpy as np
 
 from companion.sim.trajectory import Motion
-from estimators.geometry import wrap_angles
+from estimators.geometry import wrap_angle, wrap_angles
 from estimators.messages import FloatArray
 
 KEPT = 4000
@@ -43,7 +43,7 @@ class FollowedTrajectory:
         if seconds <= newest:
             return
         # Unwrapped, so that it can be interpolated.
-        turn = (pose[2] - last[2] + np.pi) % (2.0 * np.pi) - np.pi
+        turn = wrap_angle(pose[2] - last[2])
         with self._lock:
             self._poses.append((seconds, np.array([pose[0], pose[1], last[2] + turn])))
 

@@ -7,7 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 
-from companion.config import Config, Coordinate, Table, known, load_config, parse_toml, validated
+from companion.checked_toml import Table, known, parse_toml, validated
+from companion.config import Config, load_config
+from companion.config_tables import Coordinate
 from companion.errors import UserError
 from companion.sim.gait import GaitTrajectory
 from companion.sim.kidnap import Kidnapped, Walk

@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from companion.config import Coordinate, Table
+from companion.checked_toml import Table
+from companion.config_tables import Coordinate
 from estimators.immutable import immutable
 from estimators.messages import FloatArray
 

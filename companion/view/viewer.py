@@ -8,7 +8,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Literal
 
-from companion.config import ViewTable
+from companion.config_tables import ViewTable
 from companion.errors import UserError
 from companion.interrupt import set_by_signals
 

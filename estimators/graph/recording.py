@@ -1,6 +1,6 @@
 """The graph of a whole recording: a pose and a velocity for every instant at which something was measured."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -63,20 +63,13 @@ class Recording:
         measurements: in any order.
         setup: geometry of the site.
         noise: of measurements and motion.
-        arms: tag id -> (3,) antenna in the body frame [m]; a tag that is not in it sits at the setup's.
 
     Raises:
         GraphError: there is nothing to smooth.
     """
 
-    def __init__(
-        self,
-        measurements: Sequence[Measurement],
-        setup: Setup,
-        noise: Noise,
-        arms: Mapping[int, FloatArray],
-    ) -> None:
-        self._setup, self._noise, self._arms = setup, noise, arms
+    def __init__(self, measurements: Sequence[Measurement], setup: Setup, noise: Noise) -> None:
+        self._setup, self._noise = setup, noise
         self.anchor_ids = list(setup.anchors)
         self._anchors = {anchor_id: i for i, anchor_id in enumerate(self.anchor_ids)}
         self._landmarks = {i: len(setup.anchors) + k for k, i in enumerate(setup.landmarks)}
@@ -164,7 +157,7 @@ class Recording:
     def _range_rows(self, frame: RangeFrame) -> FloatArray:
         known = [i for i, anchor_id in enumerate(frame.anchor_ids.tolist()) if anchor_id in self._anchors]
         ids, measured = frame.anchor_ids[known].tolist(), frame.ranges[known]
-        arm = self._arms.get(frame.tag_id, self._setup.tag_in_body)
+        arm = self._setup.arm(frame.tag_id)
         heights = np.array([self._setup.anchors[i][2] for i in ids]) - self._setup.height - arm[2]
         rows = factors.ranges(
             self._variable(np.array([frame.stamp_ns]))[0],

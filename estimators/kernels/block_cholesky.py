@@ -254,11 +254,12 @@ def inverse_blocks(
                                 others[q, i, k] -= others[column, i, m] * scaled[p - begin, m, k]
                                 others[p, i, k] -= others[column, m, i] * scaled[q - begin, m, k]
         for i in range(3):
-            for k in range(3):
+            for k in range(i + 1):
                 total = 0.0
                 for m in range(3):
                     total += inverse[m, i] * inverse[m, k]
                     for p in range(begin, end):
                         total -= scaled[p - begin, m, i] * others[p, m, k]
-                on_diagonal[j, i, k] = total
+                # Both halves at once: what they differ by would grow from column to column.
+                on_diagonal[j, i, k] = on_diagonal[j, k, i] = total
     return on_diagonal, others

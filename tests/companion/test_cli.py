@@ -123,6 +123,12 @@ BAD_INPUT = {
     "wrong set": (["replay", "LOG", "--set", "pipeline.rate=999"], "pipeline.rate: Input should be less"),
     "missing site": (["run", "--site", "gone.toml"], "cannot read gone.toml: No such file or directory"),
     "unknown site": (["run", "--site", "gone"], "no file gone and none of that name in params/sites"),
+    "unknown site of a log": (["smooth", "LOG", "--site", "gone"], "no file gone and none of that name in"),
+    "unknown site of a drive": (
+        ["calibrate", "mounting", "LOG", "--site", "gone"],
+        "no file gone and none of that name in",
+    ),
+    "wrong view": (["demo", "--view", "moon"], "--view: 'moon' is none of web, native, off"),
     "unknown key": (["run", "--site", "unknown.toml"], "unknown.toml: site.colour: unknown key"),
     "no TOML": (["run", "--site", "text.mcap"], "text.mcap is not valid TOML"),
     "two anchors": (["run", "--site", "two.toml"], "anchors: 2 anchors given, a position needs at least 3"),

@@ -5,9 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from companion.config import Config, config_from_toml, default_toml, load_config, params_dir
+from companion.config import Config, config_from_toml, default_toml, load_config
 from companion.errors import UserError
 from companion.pipeline import make_scan_odometry
+from companion.shipped_files import params_dir
 from estimators.lidar.ekf_slam import EkfSlam
 from estimators.lidar.scan_matching import ScanMatcher
 from tests.conftest import SITE

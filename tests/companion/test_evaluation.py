@@ -11,14 +11,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from companion.config import load_config, params_dir
+from companion.config import load_config
 from companion.errors import UserError
 from companion.evaluation import Evaluation, evaluate_scenario
 from companion.evaluation_table import evaluation_notes
 from companion.log import Log
 from companion.replay import config_of, replay
+from companion.shipped_files import params_dir
 from companion.sim.scenario import load_scenario
-from companion.trial import TrialFigures, run_trial
+from companion.trial import run_trial
+from companion.trial_figures import TrialFigures
 from tests.conftest import SITE, Command, write_log, write_scenario
 
 STRAIGHT_ON = "[trajectory]\nwaypoints = [[1.5, 1.2], [3.5, 1.2]]\nlaps = 0\nrest = 1.0\n"

@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from companion.config import params_dir
 from companion.evaluate import Reference, compare
 from companion.log import Truth
 from companion.pipeline import Chain, make_pipeline
+from companion.shipped_files import params_dir
 from companion.sim.scenario import load_scenario
 from companion.sim.simulate import START_NS, converse
 from estimators.messages import PoseIncrement

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from companion.config import HealthTable
+from companion.config_tables import HealthTable
 from companion.health import HealthMonitor, State, uwb_line
 from estimators.base import Report, Verdict
 from estimators.messages import FloatArray, PoseEstimate, PoseIncrement, RangeFrame

@@ -17,10 +17,10 @@ from typer.testing import CliRunner
 
 from companion import params_cli
 from companion.cli import app
-from companion.config import params_dir
 from companion.errors import UserError
 from companion.mavlink.parameter_files import FOLDERS, read_settings, settings_file
 from companion.mavlink.parameter_names import aliases
+from companion.shipped_files import params_dir
 from tests.companion.mavlink.scripted_autopilot import ScriptedAutopilot
 
 FLOAT, INTEGER = mavlink2.MAV_PARAM_TYPE_REAL32, mavlink2.MAV_PARAM_TYPE_INT32

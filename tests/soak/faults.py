@@ -1,6 +1,6 @@
 """Walks with random faults of both sensors, an hour of them, and what reaches the autopilot meanwhile.
 
-    python tests/soak/faults.py --minutes 60
+    python -m tests.soak.faults --minutes 60
 
 Everything runs in memory in simulated time: emulated devices, drivers, estimator, health, MAVLink. Each walk
 has its own faults: noise on the lines, stalls, silence, pulled plugs, a LiDAR that stops itself. Every pose
@@ -12,25 +12,23 @@ import argparse
 import sys
 import tempfile
 from collections import Counter
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 from pymavlink.dialects.v20 import all as mavlink2
 from rich.console import Console
 
-from companion.config import params_dir
 from companion.log import RawChunk
 from companion.mavlink.link import NAME
-from companion.mavlink.session import MavlinkSession
-from companion.pipeline import Chain, Tick, make_pipeline
-from companion.sim.autopilot import EmulatedAutopilot, ned_pose
+from companion.pipeline import Tick
+from companion.sim.autopilot import ned_pose
 from companion.sim.scenario import Scenario, load_scenario
-from companion.sim.simulate import START_NS, converse
+from companion.sim.simulate import START_NS
+from tests.soak.onboard import BASE, Onboard, scenario_text
 
 KINDS = ("garbage", "truncation", "bit_flips", "stall", "silence", "disconnect")
 PROTECTION_STOP = "protection_stop"
-BASE = params_dir() / "scenarios" / "square_room.toml"
 MEAN_PAUSE = 12.0
 """From one fault to the next of the same sensor, on average [s]."""
 MEAN_FAULT = 3.0
@@ -121,7 +119,6 @@ class Listener:
 def walk(base: Path, folder: Path, seed: int, pause: float) -> Scenario:
     """A scenario with faults drawn from the seed instead of its own."""
     rng = np.random.default_rng(seed)
-    text = base.read_text(encoding="utf-8").replace('"../sites/', f'"{params_dir() / "sites"}/')
     tables = []
     for sensor in ("uwb", "lidar"):
         at = 6.0 + rng.exponential(pause)
@@ -135,7 +132,7 @@ def walk(base: Path, folder: Path, seed: int, pause: float) -> Scenario:
             )
             at += duration + rng.exponential(pause)
     path = folder / f"walk{seed}.toml"
-    path.write_text(text + "\n" + "\n".join(tables), encoding="utf-8")
+    path.write_text(scenario_text(base) + "\n" + "\n".join(tables), encoding="utf-8")
     return load_scenario(path, seed, [])
 
 
@@ -150,28 +147,19 @@ def soak(minutes: float, seed: int, folder: Path, base: Path = BASE, pause: floa
         pause: from one fault to the next of the same sensor, on average [s].
     """
     outcome = Outcome()
-    session: MavlinkSession | None = None
-    autopilot, listener = EmulatedAutopilot(), Listener(outcome)
+    listener = Listener(outcome)
+    onboard: Onboard | None = None
     begin_ns = START_NS
     while outcome.minutes < minutes:
         scenario = walk(base, folder, seed, pause)
         seed += 1
-        config = scenario.config
-        session = session or MavlinkSession(config)
-        primary = config.pipeline.estimator
-        chain = Chain(config, START_NS, make_pipeline(config, [primary]), primary)
+        onboard = onboard or Onboard(scenario.config)
         last_ns = START_NS
-        for item in converse(scenario, chain.sensors):
-            if not isinstance(item, RawChunk):
-                continue
-            for tick in chain.feed(item):
-                now_ns = begin_ns + tick.stamp_ns - START_NS
-                if heard := autopilot.poll(now_ns):
-                    session.receive(NAME, heard, now_ns, now_ns)
-                pose = tick.poses[primary]
-                session.tick(pose and replace(pose, stamp_ns=now_ns), tick.health, now_ns)
-                listener.tick(tick, session.take().get(NAME, b""), now_ns)
-            last_ns = item.stamp_ns
+        for item in onboard.walk(scenario, scenario.config.pipeline.estimator, begin_ns):
+            if isinstance(item, RawChunk):
+                last_ns = item.stamp_ns
+            else:
+                listener.tick(item.tick, item.data.get(NAME, b""), item.now_ns)
         begin_ns += last_ns - START_NS
         outcome.minutes = (begin_ns - START_NS) / 60e9
     return outcome

@@ -1,6 +1,6 @@
 """Memory of an hour's run: one walk that never ends, and what the process holds meanwhile.
 
-    python tests/soak/memory.py --minutes 60
+    python -m tests.soak.memory --minutes 60
 
 Emulated devices, drivers, estimator, health, MAVLink and the log run in memory in simulated time, as in a
 live run. What is loaded and what a window or a map of the room needs is there after some minutes; from then
@@ -12,22 +12,15 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import closing
-from dataclasses import replace
-from itertools import takewhile
 from pathlib import Path
 
 from rich.console import Console
 
-from companion.config import params_dir
 from companion.log import Direction, LogWriter, RawChunk
-from companion.mavlink.link import NAME
-from companion.mavlink.session import MavlinkSession
-from companion.pipeline import Chain, make_pipeline
-from companion.sim.autopilot import EmulatedAutopilot
 from companion.sim.scenario import load_scenario
-from companion.sim.simulate import START_NS, converse
+from companion.sim.simulate import START_NS
+from tests.soak.onboard import BASE, Onboard, scenario_text
 
-BASE = params_dir() / "scenarios" / "square_room.toml"
 SETTLED = 5.0
 """Until then the process grows [min]: code is loaded, windows and map fill."""
 ALLOWED_MB = 10.0
@@ -51,28 +44,24 @@ def held(minutes: float, estimator: str, folder: Path) -> Iterator[tuple[float, 
     Yields:
         Minute and memory [MB], every minute.
     """
-    text = BASE.read_text(encoding="utf-8").replace('"../sites/', f'"{params_dir() / "sites"}/')
     path = folder / "laps.toml"
-    path.write_text(text.replace("laps = 1\n", f"laps = {2 * round(minutes) + 1}\n"), encoding="utf-8")
+    laps = f"laps = {2 * round(minutes) + 1}\n"
+    path.write_text(scenario_text(BASE).replace("laps = 1\n", laps), encoding="utf-8")
     scenario = load_scenario(path, 1, [])
     config = scenario.config
-    session, autopilot = MavlinkSession(config), EmulatedAutopilot()
-    chain = Chain(config, START_NS, make_pipeline(config, [estimator]), estimator)
     next_ns, end_ns = START_NS, START_NS + round(minutes * 60e9)
     with closing(LogWriter(folder / "run.mcap", config.to_toml(), START_NS)) as log:
-        chunks = (item for item in converse(scenario, chain.sensors) if isinstance(item, RawChunk))
-        for chunk in takewhile(lambda chunk: chunk.stamp_ns < end_ns, chunks):
-            log.raw(chunk)
-            for tick in chain.feed(chunk):
-                if heard := autopilot.poll(tick.stamp_ns):
-                    session.receive(NAME, heard, tick.stamp_ns, tick.stamp_ns)
-                pose = tick.poses[estimator]
-                session.tick(pose and replace(pose, stamp_ns=tick.stamp_ns), tick.health, tick.stamp_ns)
-                for name, data in session.take().items():
-                    log.raw(RawChunk(name, Direction.OUT, tick.stamp_ns, data))
-            if chunk.stamp_ns >= next_ns:
-                yield (next_ns - START_NS) / 60e9, resident_mb()
-                next_ns += 60_000_000_000
+        for item in Onboard(config).walk(scenario, estimator):
+            if isinstance(item, RawChunk):
+                if item.stamp_ns >= end_ns:
+                    break
+                log.raw(item)
+                if item.stamp_ns >= next_ns:
+                    yield (next_ns - START_NS) / 60e9, resident_mb()
+                    next_ns += 60_000_000_000
+            else:
+                for name, data in item.data.items():
+                    log.raw(RawChunk(name, Direction.OUT, item.now_ns, data))
     yield minutes, resident_mb()
 
 

@@ -20,11 +20,12 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import track
 
-from companion.config import load_config, params_dir
+from companion.config import load_config
 from companion.live import LiveRun
 from companion.log import Direction, Log, RawChunk
 from companion.pipeline import make_sensors
 from companion.replay import config_of
+from companion.shipped_files import params_dir
 from companion.sim.emulate import Emulator
 from companion.sim.scenario import load_scenario
 from estimators.messages import RangeFrame, Scan

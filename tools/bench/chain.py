@@ -11,11 +11,12 @@ from tempfile import mkdtemp
 
 from pymavlink.dialects.v20 import all as mavlink2
 
-from companion.config import Config, load_config, params_dir
+from companion.config import Config, load_config
 from companion.log import Direction, Log, RawChunk
 from companion.log_edit.edit import write_log
 from companion.mavlink.link import NAME
 from companion.replay import config_of, replay
+from companion.shipped_files import params_dir
 from companion.sim.scenario import load_scenario
 from companion.sim.simulate import START_NS, records, simulate
 from drivers import make_sensor

@@ -9,10 +9,11 @@ import numpy as np
 from rich.box import SIMPLE
 from rich.table import Table
 
-from companion.config import Config, load_config, params_dir
+from companion.config import Config, load_config
 from companion.estimator_choice import chosen_settings
 from companion.log import RawChunk
 from companion.pipeline import Chain, make_pipeline
+from companion.shipped_files import params_dir
 from companion.sim.scenario import load_scenario
 from companion.sim.simulate import START_NS, records
 from estimators import make_estimator

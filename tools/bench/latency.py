@@ -26,10 +26,11 @@ import numpy as np
 from pymavlink.dialects.v20 import all as mavlink2
 from rich.console import Console
 
-from companion.config import load_config, params_dir
+from companion.config import load_config
 from companion.live import LiveRun
 from companion.log import Direction, Log, RawChunk
 from companion.mavlink.link import NAME
+from companion.shipped_files import params_dir
 from companion.view.viewer import free_port
 
 RANGE_RATE = 50

@@ -10,11 +10,13 @@ from statistics import fmean
 
 import numpy as np
 
-from companion.config import params_dir
+from companion.shipped_files import params_dir
 from companion.sim.measurements import measure as measured_walk
 from companion.sim.measurements import setup_of
 from companion.sim.scenario import load_scenario
-from companion.trial import TrialFigures, make_choice, run_trial
+from companion.trial import run_trial
+from companion.trial_figures import TrialFigures
+from companion.watched_choices import make_choice
 from tools.bench.rows import Benchmark, Row, Run
 
 OURS, RIVALS = "pf_ibas:40", ("pf:200", "pf:1000")

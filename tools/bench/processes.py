@@ -11,7 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from companion.config import params_dir
+from companion.shipped_files import params_dir
 from tools.bench.rows import Row
 
 _STARTS = 5

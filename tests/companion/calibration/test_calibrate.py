@@ -10,7 +10,8 @@ from typer.testing import CliRunner
 from companion.calibrate_cli import app
 from companion.calibration.drive import calibrate_on_drive, mounting_on_drive
 from companion.calibration.recording import Recording, read_recording
-from companion.config import Config, TagBiasTable, load_config
+from companion.config import Config, load_config
+from companion.config_tables import TagBiasTable
 from companion.errors import UserError
 from companion.log import Log, RawChunk, Truth
 from companion.log_edit.edit import edit_log

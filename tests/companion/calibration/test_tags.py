@@ -14,11 +14,12 @@ from companion.calibrate_cli import app
 from companion.calibration.recording import read_recording
 from companion.calibration.reference import poses_from_truth, tags_from_truth
 from companion.calibration.tags import fit_tags
-from companion.config import Config, load_config, params_dir
+from companion.config import Config, load_config
 from companion.errors import UserError
 from companion.importers.sources import import_log
 from companion.log import Log, RawChunk
 from companion.log_trial import run_records
+from companion.shipped_files import params_dir
 from companion.smooth import SMOOTHED, smooth_log
 from estimators.messages import RangeFrame
 from estimators.models.range_bias import BearingBias

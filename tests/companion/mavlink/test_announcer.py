@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import all as mavlink2
 
-from companion.config import HealthTable
+from companion.config_tables import HealthTable
 from companion.health import Health, HealthMonitor
 from companion.mavlink.announcer import Announcer
 from companion.mavlink.gate import Decision

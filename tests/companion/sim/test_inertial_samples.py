@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from companion.config import params_dir
 from companion.errors import UserError
+from companion.shipped_files import params_dir
 from companion.sim.measurements import MeasuredWalk, measure
 from companion.sim.scenario import load_scenario
 from companion.sim.simulate import START_NS

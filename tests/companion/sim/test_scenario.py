@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from companion.config import params_dir
 from companion.errors import UserError
 from companion.log import Log, Truth
+from companion.shipped_files import params_dir
 from companion.sim.scenario import load_scenario
 from tests.conftest import SCENARIO, write_log, write_scenario
 

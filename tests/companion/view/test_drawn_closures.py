@@ -7,43 +7,20 @@ import numpy as np
 import pytest
 
 from companion.config import Config
-from companion.health import Health, State
-from companion.look_back import LookBack
-from companion.pipeline import Pipeline, Tick
+from companion.pipeline import Tick
 from companion.view.files import RerunFiles
-from estimators.base import Estimator, Report, Setup, Start, Verdict
-from estimators.graph.smoother import GraphSmoother
-from estimators.lidar.loop_closure import LoopCloser
-from estimators.lidar.odometry import LidarOdometry
-from estimators.lidar.scan_matching import ScanMatcher
+from estimators.base import Report, Verdict
 from estimators.messages import FloatArray, LoopClosure
+from tests.companion.second_round import PATH, PERIOD_NS, drive
 from tests.companion.view.recordings import Recording, read
-from tests.estimators.lidar.room_scans import PERIOD, ROOM, Loop, scan_while_moving
 
 GREEN, BLUE = 0x009E73FF, 0x4678DCFF
-PERIOD_NS = round(PERIOD * 1e9)
-PATH = Loop(speed=1.5)
 
 
 @pytest.fixture(scope="module")
 def ticks() -> list[Tick]:
-    """A round and a bit by scans alone, with a smoother that closes it and odometry that does not."""
-    rng = np.random.default_rng(1)
-    start = Start(PATH.poses(np.array([PERIOD]))[0], np.array([0.01, 0.01, 0.01]))
-    setup = Setup({}, np.zeros(3), start, height=0.3, height_sigma=0.02, level_sigma=0.02)
-    matcher = ScanMatcher(ScanMatcher.Config(), np.zeros(3))
-    estimators: dict[str, Estimator] = {
-        "graph": GraphSmoother(GraphSmoother.Config(nlos=()), setup),
-        "lidar_odometry": LidarOdometry(LidarOdometry.Config(), setup),
-    }
-    pipeline = Pipeline(matcher, estimators, LookBack(LoopCloser.Config(), matcher))
-    health = Health(State.OK, "")
-    found = []
-    for k in range(130):
-        outcomes = pipeline.step(scan_while_moving(ROOM, PATH, k * PERIOD, rng, 0.015))
-        stamp_ns = (k + 1) * PERIOD_NS
-        found.append(Tick(stamp_ns, outcomes, pipeline.poses_at(stamp_ns), health))
-    return found
+    """A round and a bit."""
+    return list(drive(130))
 
 
 def closures(ticks: list[Tick]) -> list[LoopClosure]:

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from companion.config import ViewTable, load_config
+from companion.config import load_config
+from companion.config_tables import ViewTable
 from companion.log import Log
 from companion.replay import config_of, replay
 from companion.view.files import RerunFiles

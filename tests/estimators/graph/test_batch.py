@@ -84,7 +84,7 @@ def found_places(found: Smoothed) -> FloatArray:
 
 def test_every_pose_gets_better_by_what_comes_after_it() -> None:
     truth = course(150)
-    found = smooth(Recording(drive(truth, 1), HALL, NOISE, {}), lambda _: at_truth(truth, 0.3))
+    found = smooth(Recording(drive(truth, 1), HALL, NOISE), lambda _: at_truth(truth, 0.3))
     np.testing.assert_array_equal(found.stamps_ns, STEP_NS * np.arange(150))
     errors = np.array([pose_error(a, b) for a, b in zip(found.poses, truth, strict=True)])
     assert np.sqrt((errors[:, :2] ** 2).sum(axis=1).mean()) < 0.03
@@ -124,7 +124,7 @@ BIASES = {10: 0.15, 11: 0.3, 12: 0.2, 13: 0.1}
 def survey(truth: FloatArray, seed: int) -> Smoothed:
     """What a drive tells of anchors whose places were known to half a metre."""
     setup = replace(displaced(HALL, 0.5, seed), start=replace(HALL.start, pose=truth[0]))
-    recording = Recording(drive(truth, seed, BIASES), setup, NOISE, {})
+    recording = Recording(drive(truth, seed, BIASES), setup, NOISE)
     guess = at_truth(truth, 0.1)
     return smooth(recording, lambda _: guess, find_anchors=True, find_biases=True)
 
@@ -132,7 +132,7 @@ def survey(truth: FloatArray, seed: int) -> Smoothed:
 def bias_sigmas(truth: FloatArray) -> FloatArray:
     """Cramer-Rao bounds of the biases that a drive tells [m]: the inverse information at the truth."""
     setup = replace(HALL, start=replace(HALL.start, pose=truth[0]))
-    recording = Recording(drive(truth, 0), setup, NOISE, {})
+    recording = Recording(drive(truth, 0), setup, NOISE)
     graph = recording.graph(truth, find_anchors=True, find_biases=True)
     graph.ranges[:, factors.RANGE_LOSS] = GAUSSIAN.kind
     sigmas: FloatArray = np.sqrt(solve(graph).covariances(graph.free)[: len(HALL.anchors), 2, 2])
@@ -173,7 +173,7 @@ def test_blocked_ranges_are_left_out() -> None:
     for k, measurement in enumerate(measured):
         if 200 <= k < 280 and isinstance(measurement, RangeFrame):
             measurement.ranges[2] += 0.6
-    found = smooth(Recording(measured, HALL, NOISE, {}), lambda _: at_truth(truth, 0.1))
+    found = smooth(Recording(measured, HALL, NOISE), lambda _: at_truth(truth, 0.1))
     blocked = {i: fix.blocked for i, fix in found.anchors.items()}
     assert 40 <= blocked[12] < 75
     assert max(blocked[i] for i in (10, 11, 13)) < 45
@@ -191,15 +191,15 @@ def test_landmarks_count() -> None:
         bearing = np.arctan2(offset[1], offset[0]) - pose[2]
         ids, distances = np.array([3, 99]), np.array([np.hypot(*offset), 1.0])
         looks.append(LandmarkFrame(k * STEP_NS, ids, distances, np.array([bearing, 0.0]), 0.02, 0.01))
-    blind = smooth(Recording(measured, setup, NOISE, {}), lambda _: truth)
-    seeing = smooth(Recording([*measured, *looks], setup, NOISE, {}), lambda _: truth)
+    blind = smooth(Recording(measured, setup, NOISE), lambda _: truth)
+    seeing = smooth(Recording([*measured, *looks], setup, NOISE), lambda _: truth)
     assert np.trace(seeing.covs[20][:2, :2]) < 0.5 * np.trace(blind.covs[20][:2, :2])
 
 
 def test_ranges_of_a_tag_in_the_middle_tell_no_heading() -> None:
     setup, truth = replace(HALL, tag_in_body=np.array([0.0, 0.0, 0.35])), course(300)
     frames = [true_ranges(k * STEP_NS, pose, setup) for k, pose in enumerate(truth)]
-    found = smooth(Recording(frames, setup, NOISE, {}), lambda _: at_truth(truth, 0.2))
+    found = smooth(Recording(frames, setup, NOISE), lambda _: at_truth(truth, 0.2))
     assert np.isinf(found.covs[:, 2, 2]).all()
     assert np.hypot(*(found.poses - truth)[:, :2].T).max() < 0.05
 
@@ -213,22 +213,22 @@ def test_impossible_measurements_are_left_out(bad: float) -> None:
         PoseIncrement(0, 3 * STEP_NS, np.full(3, np.nan), np.eye(3), is_keyframe=False),
         PoseIncrement(0, 3 * STEP_NS, np.zeros(3), -np.eye(3), is_keyframe=False),
     ]
-    a, b = (smooth(Recording(m, HALL, NOISE, {}), lambda _: truth) for m in (clean, [*clean, *odd]))
+    a, b = (smooth(Recording(m, HALL, NOISE), lambda _: truth) for m in (clean, [*clean, *odd]))
     np.testing.assert_array_equal(a.poses, b.poses)
 
 
 def test_an_anchor_that_was_never_heard_is_named() -> None:
     truth = course(30)
     setup = replace(HALL, anchors={**HALL.anchors, 44: np.array([1.0, 1.0, 2.0])})
-    found = smooth(Recording(drive(truth, 8), setup, NOISE, {}), lambda _: truth)
+    found = smooth(Recording(drive(truth, 8), setup, NOISE), lambda _: truth)
     assert found.anchors[44].ranges == 0
     with pytest.raises(GraphError, match="anchor 44: no range determines it"):
-        smooth(Recording(drive(truth, 8), setup, NOISE, {}), lambda _: truth, find_anchors=True)
+        smooth(Recording(drive(truth, 8), setup, NOISE), lambda _: truth, find_anchors=True)
 
 
 def test_an_empty_recording_is_refused() -> None:
     with pytest.raises(GraphError, match="recording: ranges or increments at 1 instants"):
-        Recording([range_frame(0, [], [])], HALL, NOISE, {})
+        Recording([range_frame(0, [], [])], HALL, NOISE)
 
 
 ANCHORS = {
@@ -284,7 +284,7 @@ def first_guess(ranges: FloatArray, at: FloatArray) -> FloatArray:
 def test_a_real_drive_without_lidar_surveys_its_anchors(seed: int) -> None:
     stamps_ns, ranges = real_ranges()
     start = Start(np.zeros(3), np.array([10.0, 10.0, 10.0]))
-    truth = Setup(ANCHORS, np.zeros(3), start, height=0.965, height_sigma=0.02, level_sigma=0.02)
+    truth = Setup(ANCHORS, np.zeros(3), start, height=0.965, height_sigma=0.02, level_sigma=0.02, tags=ARMS)
     setup = displaced(truth, 0.5, seed)
     frames = [
         replace(range_frame(int(stamp_ns), list(ANCHORS), frame[:, tag].tolist()), tag_id=tag)
@@ -292,9 +292,7 @@ def test_a_real_drive_without_lidar_surveys_its_anchors(seed: int) -> None:
         for tag in ARMS
     ]
     guess = first_guess(ranges, places(setup))
-    found = smooth(
-        Recording(frames, setup, NOISE, ARMS), lambda _: guess, find_anchors=True, find_biases=True
-    )
+    found = smooth(Recording(frames, setup, NOISE), lambda _: guess, find_anchors=True, find_biases=True)
     errors = np.linalg.norm(aligned(found_places(found), places(truth)) - places(truth), axis=1)
     assert errors.max() < 0.15
     # With known anchors the biases are 0.09 to 0.26 m, 0.16 m on average.

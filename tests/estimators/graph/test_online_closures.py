@@ -93,7 +93,7 @@ def test_a_window_with_places_says_what_the_whole_graph_says() -> None:
     for measurement in measured:
         assert online.update(measurement).verdicts == (Verdict.ACCEPTED,)
     noise = Noise(range_sigma=0.1, accel=0.5, yaw_accel=0.5)
-    whole = smooth(Recording(measured, ON_THE_MARK, noise, {}), lambda _: truth)
+    whole = smooth(Recording(measured, ON_THE_MARK, noise), lambda _: truth)
     assert (whole.closures, whole.false_closures) == (LAP // 4, 0)
     mean, cov = online.state
     sigma = np.sqrt(np.diag(whole.covs[-1]))
@@ -114,7 +114,7 @@ def test_false_closures_are_refused_online_and_in_the_whole_graph() -> None:
     refused = [i for i, verdict in enumerate(verdicts) if verdict is Verdict.GATED]
     assert refused == wrong[1::3]
     noise = Noise(range_sigma=0.1, accel=0.5, yaw_accel=0.5)
-    whole = smooth(Recording(measured, ON_THE_MARK, noise, {}), lambda _: truth)
+    whole = smooth(Recording(measured, ON_THE_MARK, noise), lambda _: truth)
     assert whole.false_closures == len(wrong[1::3])
     assert np.hypot(*(whole.poses[-1] - truth[-1])[:2]) < 0.1
 
