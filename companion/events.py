@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from math import cos, isfinite, sin
 
 import numpy as np
 
@@ -12,8 +13,7 @@ from companion.evaluate import Errors
 from companion.health import Health, State
 from companion.pipeline import Tick
 from estimators.base import Report, Verdict
-from estimators.geometry import transform
-from estimators.messages import FloatArray, PoseEstimate, RangeFrame, Scan
+from estimators.messages import PoseEstimate, RangeFrame, Scan
 
 GAP_NS = 1_000_000_000
 """Refusals further apart than this are two stories."""
@@ -134,7 +134,7 @@ class EventFinder:
             for k, i in enumerate(frame.anchor_ids[: len(report.verdicts)].tolist())
             if i in self._config.anchors and report.verdicts[k] is not Verdict.NOT_USED
         ]
-        tag = None if pose is None else _tag(pose, self._config.body.tag[:2]).tolist()
+        tag = None if pose is None else _tag(pose, self._config.body.tag)
         refused = 0
         for k, i, verdict in known:
             self._take_sign(f"A{i}", frame.stamp_ns)
@@ -256,9 +256,11 @@ def worst_error(errors: Errors, begin_ns: int) -> Event | None:
     )
 
 
-def _tag(pose: PoseEstimate, tag_in_body: Sequence[float]) -> FloatArray:
-    """The tag, (2,) [m], map frame; where the heading is not known its lever arm is left out."""
-    if not np.isfinite(pose.cov[5, 5]):
-        return pose.xy
-    tag: FloatArray = transform(np.array([*pose.xy, pose.yaw]), np.array([tag_in_body]))[0]
-    return tag
+def _tag(pose: PoseEstimate, tag_in_body: Sequence[float]) -> tuple[float, float]:
+    """Where the tag is, x and y [m], map frame; where the heading is not known its lever arm is left out."""
+    x, y = pose.xy.tolist()
+    if isfinite(pose.cov[5, 5]):
+        c, s = cos(pose.yaw), sin(pose.yaw)
+        ahead, left = tag_in_body[:2]
+        x, y = x + c * ahead - s * left, y + s * ahead + c * left
+    return x, y

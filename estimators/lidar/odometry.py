@@ -35,7 +35,11 @@ class LidarOdometry(KeyframeTracker):
         """Settings of `lidar_odometry`."""
 
     def __init__(self, config: Config, setup: Setup) -> None:
+        # Numba loads slowly: only who makes an estimator waits for it.
+        from estimators.kernels.motion import predicted
+
         super().__init__(config, setup)
+        self._predicted = predicted
         self.reset()
 
     @property
@@ -50,12 +54,11 @@ class LidarOdometry(KeyframeTracker):
         """
         if self._stamp_ns is None or not self._reaches(stamp_ns):
             return None
-        F, Q = self._motion(0.0 if self._stands else (stamp_ns - self._stamp_ns) * 1e-9)
-        cov = F @ self._filter.P[MOVING, MOVING] @ F.T + Q
-        return self._estimate(stamp_ns, F @ self._filter.x[MOVING], cov, self._heading_known)
-
-    def _motion(self, dt: float) -> tuple[FloatArray, FloatArray]:
-        return constant_velocity(dt, *self._accel_noise)
+        dt = 0.0 if self._stands else (stamp_ns - self._stamp_ns) * 1e-9
+        mean, cov = self._predicted(
+            self._filter.x, np.ascontiguousarray(self._filter.P), dt, *self._accel_noise
+        )
+        return self._estimate(stamp_ns, mean[MOVING], cov[MOVING, MOVING], self._heading_known)
 
     def _place(self, pose: FloatArray, cov: FloatArray) -> None:
         self._filter = ExtendedKalmanFilter(dim_x=9, dim_z=3)
@@ -71,7 +74,7 @@ class LidarOdometry(KeyframeTracker):
 
     def _move(self, dt: float) -> None:
         F, Q = np.eye(9), np.zeros((9, 9))
-        F[MOVING, MOVING], Q[MOVING, MOVING] = self._motion(dt)
+        F[MOVING, MOVING], Q[MOVING, MOVING] = constant_velocity(dt, *self._accel_noise)
         self._filter.F, self._filter.Q = F, Q
         self._filter.predict()
 
