@@ -29,6 +29,7 @@ from companion.view.drawing import Item
 from companion.view.line import Line
 from companion.view.live_view import LiveView
 from companion.view.viewer import Shown, check_viewer
+from drivers import dtr_stops
 from drivers.discovery import Finder
 from drivers.inbox import Inbox
 from drivers.port import AutoAddress, Port, PortEvent, PortStatus, parse_address
@@ -130,22 +131,29 @@ class LiveRun:
         if view != "off" or config.view.record:
             files = folder / "view.rrd" if config.view.record else None
             self._view = LiveView(config, [self._primary], start_ns, view, files, say)
-        pipeline = make_pipeline(config, [self._primary])
-        self._chain = Chain(config, start_ns, pipeline, self._primary, watched=self._view is not None)
         self._ports = {name: self._make_port(name, table) for name, table in config.sensor.items()}
         self._open_sensors: set[str] = set()
+        for port in (*self._ports.values(), *self._links.values()):
+            port.start()
+        try:
+            # Estimators take a second to load; what arrives meanwhile waits.
+            pipeline = make_pipeline(config, [self._primary])
+        except UserError:
+            self._close_ports()
+            raise
+        self._chain = Chain(config, start_ns, pipeline, self._primary, watched=self._view is not None)
+        self._ready_ns = time.monotonic_ns()
         if warning := budget_warning(config):
             say(warning)
 
     def run(self, stop: threading.Event) -> None:
         """Work until `stop` is set, then leave the devices quiet and close everything."""
-        for port in self._ports.values():
-            port.start()
-        for link in self._links.values():
-            link.start()
         try:
+            while not stop.is_set() and self._take_waiting(0.0):
+                pass
             while not stop.is_set():
-                self._wait_and_take()
+                until_tick = (self._chain.next_tick_ns - time.monotonic_ns()) * 1e-9
+                self._take_waiting(min(max(until_tick, 0.0), LONGEST_WAIT))
                 self._work(self._chain.advance(time.monotonic_ns()))
                 self._talk_to_devices()
                 self._say_drops()
@@ -158,14 +166,14 @@ class LiveRun:
             closing = threading.Event()
             finder = Finder(address, table.driver, closing)
             return Port(name, finder, finder, self._inbox.put, closing)
-        dtr_stops = self._chain.sensors[name].DTR_STOPS
-        return Port(name, address, lambda: SerialWire(address, dtr_stops), self._inbox.put)
+        return Port(name, address, lambda: SerialWire(address, dtr_stops(table.driver)), self._inbox.put)
 
-    def _wait_and_take(self) -> None:
-        """Wait for the next event or tick, then take what every port has waiting for its turn."""
-        until_tick = (self._chain.next_tick_ns - time.monotonic_ns()) * 1e-9
-        for event in self._inbox.take(min(max(until_tick, 0.0), LONGEST_WAIT)):
+    def _take_waiting(self, timeout: float) -> bool:
+        """Wait so long [s] for events, then take a turn of every port; whether there were any."""
+        events = self._inbox.take(timeout)
+        for event in events:
             self._take(event)
+        return bool(events)
 
     def _take(self, event: PortEvent) -> None:
         if isinstance(event, PortStatus):
@@ -212,7 +220,7 @@ class LiveRun:
         now_ns = time.monotonic_ns()
         # The loop fell behind: an autopilot is better off with a gap than with a burst of old poses.
         is_late = now_ns - tick.stamp_ns > self._period_ns
-        self.status.stale_ticks += is_late
+        self.status.stale_ticks += is_late and tick.stamp_ns > self._ready_ns
         packed = self._session.poses_packed
         for outcome in tick.outcomes:
             self._session.observe(outcome.measurement, outcome.reports[self._primary])
@@ -264,6 +272,10 @@ class LiveRun:
         if data and self._ports[name].write(data):
             self._log.raw(RawChunk(name, Direction.OUT, time.monotonic_ns(), data))
 
+    def _close_ports(self) -> None:
+        for port in (*self._ports.values(), *self._links.values()):
+            port.close()
+
     def _say_drops(self) -> None:
         now_ns = time.monotonic_ns()
         if self.status.dropped_chunks > self._drops_said and now_ns >= self._drops_due_ns:
@@ -285,10 +297,7 @@ class LiveRun:
             for data in sensor.closing():
                 self._send(name, data)
                 time.sleep(CLOSING_PAUSE)
-        for port in self._ports.values():
-            port.close()
-        for link in self._links.values():
-            link.close()
+        self._close_ports()
         self._poses.close()
         self._ranges.close()
         self._log.close()

@@ -4,7 +4,6 @@ from math import log
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt
 
 from estimators.geometry import transform
 from estimators.immutable import immutable
@@ -41,6 +40,9 @@ class FloorMap:
         """
         if not self.occupied.any():
             return np.zeros(self.occupied.shape, dtype=np.float32)
+        # SciPy's images load slowly: only who has a map waits for them.
+        from scipy.ndimage import distance_transform_edt
+
         distance = distance_transform_edt(~self.occupied) * self.cell
         return np.exp(-0.5 * (distance / sigma) ** 2).astype(np.float32)
 

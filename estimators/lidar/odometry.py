@@ -6,7 +6,6 @@ increment exactly what it is, a measurement between two poses that are both unce
 """
 
 import numpy as np
-from filterpy.kalman import ExtendedKalmanFilter
 
 from estimators.base import Report, Setup, Verdict
 from estimators.geometry import wrap_angle
@@ -61,6 +60,9 @@ class LidarOdometry(KeyframeTracker):
         return self._estimate(stamp_ns, mean[MOVING], cov[MOVING, MOVING], self._heading_known)
 
     def _place(self, pose: FloatArray, cov: FloatArray) -> None:
+        # Filterpy loads slowly, with SciPy's statistics: only who makes a filter waits for it.
+        from filterpy.kalman import ExtendedKalmanFilter
+
         self._filter = ExtendedKalmanFilter(dim_x=9, dim_z=3)
         self._filter.x = np.concatenate([pose, np.zeros(3), pose])
         self._filter.P = np.zeros((9, 9))

@@ -8,7 +8,6 @@ axes along the body's.
 from typing import ClassVar, Literal
 
 import numpy as np
-from filterpy.kalman import ExtendedKalmanFilter
 from pydantic import Field
 
 from estimators.base import Report, Setup, Verdict
@@ -94,6 +93,9 @@ class UwbImuEkf:
         self._is_placed = False
         self._heading_known = False
         self._reset_counter = -1
+        # Filterpy loads slowly, with SciPy's statistics: only who makes a filter waits for it.
+        from filterpy.kalman import ExtendedKalmanFilter
+
         self._filter = ExtendedKalmanFilter(dim_x=self.STATES, dim_z=2)
         self._filter.x = np.zeros(self.STATES)
         self._filter.P = np.zeros((self.STATES, self.STATES))
