@@ -114,11 +114,11 @@ class LiveRun:
         self._signing_clock = SigningClock(Path(key_file)) if key_file else None
         key = read_key(Path(key_file)) if key_file else None
         self._session = MavlinkSession(config, key, self._signing_clock, watch)
-        start_ns = time.monotonic_ns()
-        self._anchors_due_ns = start_ns + ANCHORS_PERIOD_NS
+        self._config, self._start_ns = config, time.monotonic_ns()
+        self._anchors_due_ns = self._start_ns + ANCHORS_PERIOD_NS
         if view != "off":
             check_viewer(view, config.view)
-        self._log = LogWriter(folder / "raw.mcap", config.to_toml(), start_ns)
+        self._log = LogWriter(folder / "raw.mcap", config.to_toml(), self._start_ns)
         try:
             (folder / "config.toml").write_text(config.to_toml(), encoding="utf-8")
             self._poses = (folder / "poses.tum").open("w", encoding="utf-8", buffering=1)
@@ -130,25 +130,30 @@ class LiveRun:
         self._period_ns = round(1e9 / config.pipeline.rate)
         if view != "off" or config.view.record:
             files = folder / "view.rrd" if config.view.record else None
-            self._view = LiveView(config, [self._primary], start_ns, view, files, say)
+            self._view = LiveView(config, [self._primary], self._start_ns, view, files, say)
         self._ports = {name: self._make_port(name, table) for name, table in config.sensor.items()}
         self._open_sensors: set[str] = set()
-        for port in (*self._ports.values(), *self._links.values()):
-            port.start()
-        try:
-            # Estimators take a second to load; what arrives meanwhile waits.
-            pipeline = make_pipeline(config, [self._primary])
-        except UserError:
-            self._close_ports()
-            raise
-        self._chain = Chain(config, start_ns, pipeline, self._primary, watched=self._view is not None)
-        self._ready_ns = time.monotonic_ns()
         if warning := budget_warning(config):
             say(warning)
 
     def run(self, stop: threading.Event) -> None:
         """Work until `stop` is set, then leave the devices quiet and close everything."""
+        for port in (*self._ports.values(), *self._links.values()):
+            port.start()
         try:
+            # Estimators take a second to load; what arrives meanwhile waits.
+            pipeline = make_pipeline(self._config, [self._primary])
+            self._chain = Chain(
+                self._config, self._start_ns, pipeline, self._primary, watched=self._view is not None
+            )
+            self._ready_ns = time.monotonic_ns()
+            self._loop(stop)
+        finally:
+            self._close()
+
+    def _loop(self, stop: threading.Event) -> None:
+        try:
+            # What came while all was loading, before any tick that is later.
             while not stop.is_set() and self._take_waiting(0.0):
                 pass
             while not stop.is_set():
@@ -158,7 +163,7 @@ class LiveRun:
                 self._talk_to_devices()
                 self._say_drops()
         finally:
-            self._close()
+            self._leave_devices()
 
     def _make_port(self, name: str, table: SensorTable) -> Port:
         address = parse_address(table.port)
@@ -272,10 +277,6 @@ class LiveRun:
         if data and self._ports[name].write(data):
             self._log.raw(RawChunk(name, Direction.OUT, time.monotonic_ns(), data))
 
-    def _close_ports(self) -> None:
-        for port in (*self._ports.values(), *self._links.values()):
-            port.close()
-
     def _say_drops(self) -> None:
         now_ns = time.monotonic_ns()
         if self.status.dropped_chunks > self._drops_said and now_ns >= self._drops_due_ns:
@@ -290,14 +291,17 @@ class LiveRun:
                 self._anchors_said, self._anchors_due_ns = line, now_ns + ANCHORS_PERIOD_NS
                 self._say(line)
 
-    def _close(self) -> None:
+    def _leave_devices(self) -> None:
         # So far a replay gives ticks, though nothing arrived after the last of them.
         self._log.raw(RawChunk(MAVLINK, Direction.IN, self._chain.stamp_to_log(0), b""))
         for name, sensor in self._chain.sensors.items():
             for data in sensor.closing():
                 self._send(name, data)
                 time.sleep(CLOSING_PAUSE)
-        self._close_ports()
+
+    def _close(self) -> None:
+        for port in (*self._ports.values(), *self._links.values()):
+            port.close()
         self._poses.close()
         self._ranges.close()
         self._log.close()
