@@ -17,7 +17,7 @@ from companion.pipeline import Pipeline, make_pipeline
 from companion.replay import config_of, replay, tum_line
 from tests.conftest import SITE
 
-LOADING = 0.8
+LOADING = 1.5
 """How long it takes [s]."""
 
 pytestmark = pytest.mark.realtime
@@ -33,7 +33,7 @@ def test_ranges_that_come_while_estimators_load_count_from_then_on(
 ) -> None:
     make_pipeline(load_config(SITE, []), ["ekf"])  # so that loading takes what it takes here
     monkeypatch.setattr(live, "make_pipeline", loading_slowly)
-    chunks = [r for r in Log(short_log) if isinstance(r, RawChunk) and r.source == "uwb"][:40]
+    chunks = [r for r in Log(short_log) if isinstance(r, RawChunk) and r.source == "uwb"][:50]
     master, slave = os.openpty()
     tty.setraw(slave)
     port = f"sensor.uwb.port={os.ttyname(slave)}"
