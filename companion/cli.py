@@ -1,5 +1,6 @@
 """The commands. Data goes to files or stdout, progress and messages to stderr."""
 
+import gc
 import logging
 import sys
 from typing import Annotated, Any, NoReturn
@@ -82,6 +83,8 @@ app.add_typer(evaluate_app, name="evaluate", cls=_ScenarioUnlessNamed)
 
 def main() -> NoReturn:
     """Entry point: user errors become one line and exit code 2."""
+    # Little here has cycles, and what a long replay keeps is looked through again and again for them.
+    gc.set_threshold(20_000, 20, 20)
     logging.basicConfig(
         level=logging.WARNING, format="%(message)s", handlers=[RichHandler(console=err, show_path=False)]
     )
