@@ -28,7 +28,7 @@ class Candidates:
         rows: (N, 4) anchor x and y [m], map frame, horizontal range and its standard deviation [m], as
             `estimators.kernels` has them; of infinite sigma where something is wrong.
         bias_by_pose: (N, 3) derivative by the pose of what was taken off for the bearing.
-        codes: (N,) verdicts of `RangeGate.judge_together` as `estimators.kernels` has them.
+        codes: (N,) the gate's verdicts as `estimators.kernels` has them, once it has judged.
     """
 
     frame: RangeFrame

@@ -111,7 +111,7 @@ def expected_at(
         rows: (N, 4) likewise.
         bias_by_pose: (N, 3) derivative by the pose of what was taken off the ranges.
         pose: (3,) x [m], y [m], yaw [rad] of the body in the map.
-        cov: (N, N) beginning with that of the pose.
+        cov: (K, K) beginning with that of the pose.
         arm_x: tag antenna in the body frame [m].
         arm_y: likewise.
 

@@ -23,6 +23,12 @@ Beyond some 20 deg a filter that is linear in the heading grows sure of a wrong 
 such case while the matcher finds its old keyframe again: then the reference, and its heading, is still held.
 """
 
+_WIDEST = np.square([1e3, 1e3, 2.0 * np.pi, 1e3, 1e3, 1e3, 1e3, 1e3, 2.0 * np.pi])
+"""Variances [m^2, rad^2, m^2/s^2, rad^2/s^2] of a state of which nothing is known.
+
+Without a measurement they would in time grow so much that of a range's own variance rounding leaves nothing.
+"""
+
 
 class LidarOdometry(KeyframeTracker):
     """Kalman filter (filterpy) on increments only; what drifts here is what UWB must hold.
@@ -79,6 +85,10 @@ class LidarOdometry(KeyframeTracker):
         F[MOVING, MOVING], Q[MOVING, MOVING] = constant_velocity(dt, *self._accel_noise)
         self._filter.F, self._filter.Q = F, Q
         self._filter.predict()
+        variances = np.diag(self._filter.P)
+        if (variances > _WIDEST).any():
+            scale = np.sqrt(_WIDEST / np.maximum(variances, _WIDEST))
+            self._filter.P *= np.outer(scale, scale)
 
     def _begin_anew(self) -> None:
         self._heading_known &= bool(self._filter.P[2, 2] < MAX_HEADING_SIGMA**2)

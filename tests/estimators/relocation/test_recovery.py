@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from estimators import estimator_config_class, make_estimator
@@ -268,6 +268,7 @@ def test_the_same_input_gives_the_same_poses_to_the_last_bit_also_after_reset(na
 @pytest.mark.parametrize("name", FILTERS)
 @settings(max_examples=15)
 @given(stream=hostile_streams(), known=st.booleans())
+@example(stream=[range_frame(10**18, [2, 4], [11.0, 2.0])], known=True)  # 30 years later
 def test_hostile_streams_get_verdicts_and_no_pose_that_is_no_number(
     name: str, stream: list[Measurement], known: bool
 ) -> None:
