@@ -117,6 +117,30 @@ def distance_to(points: FloatArray, segment: FloatArray) -> FloatArray:
     return distances
 
 
+def test_evenly_spread_beams_are_drawn_and_none_without_a_return(run: Run, tmp_path: Path) -> None:
+    most = 70
+    config = run.config.model_copy(update={"view": run.config.view.model_copy(update={"scan_points": most})})
+    scans = run.measurements(Scan)
+    assert all(len(scan.ranges) > most and len(scan.ranges) % most for scan in scans)
+    view = RerunFiles(config, ["ekf"], tmp_path / "run.rrd", run.ticks[0][0].stamp_ns)
+    for tick, truth in run.ticks:
+        outcomes = [
+            replace(o, measurement=half_blind(o.measurement)) if isinstance(o.measurement, Scan) else o
+            for o in tick.outcomes
+        ]
+        view.tick(replace(tick, outcomes=outcomes), truth)
+    view.close()
+    drawn = [len(row) for row in read(tmp_path / "run.rrd")["map/scan"]["Points2D:positions"]]
+    assert len(drawn) == len(scans)
+    assert 0.7 * most / 2 < np.median(drawn) <= max(drawn) <= most / 2
+
+
+def half_blind(scan: Scan) -> Scan:
+    """A scan whose first half met nothing."""
+    count = len(scan.ranges)
+    return replace(scan, ranges=np.where(np.arange(count) < count / 2, 0.0, 3.0))
+
+
 def test_ranges_go_from_tag_to_anchor_in_the_colour_of_their_verdict(run: Run, recording: Recording) -> None:
     frames = run.measurements(RangeFrame)
     assert len(recording["map/ranges"]["LineStrips2D:strips"]) == len(frames)
