@@ -185,23 +185,23 @@ class MapScene:
         """Each beam's end, seen from the pose at the time of that beam."""
         if not batch.scans or not self._config.view.scan_points:
             return
-        beams = [_thin(len(scan.ranges), self._config.view.scan_points) for scan in batch.scans]
-        row = np.repeat(np.arange(len(beams)), [len(kept) for kept in beams])
-        kept = list(zip(batch.scans, beams, strict=True))
-        beam_ns = np.concatenate(
-            [s.stamp_ns + np.round(s.beam_times[b] * 1e9).astype(np.int64) for s, b in kept]
-        )
-        ranges = np.concatenate([scan.ranges[b] for scan, b in kept])
+        most = self._config.view.scan_points
+        kept = [(scan, slice(None, None, -(-len(scan.ranges) // most))) for scan in batch.scans]
+        ranges = np.concatenate([scan.ranges[beams] for scan, beams in kept])
+        begins_ns = np.array([scan.stamp_ns for scan in batch.scans])
+        row = np.repeat(np.arange(len(kept)), [len(scan.ranges[beams]) for scan, beams in kept])
+        after = np.concatenate([scan.beam_times[beams] for scan, beams in kept])
+        beam_ns = begins_ns[row] + np.round(after * 1e9).astype(np.int64)
         lidar_x, lidar_y, lidar_yaw = self._config.lidar_mounting()
-        angles = np.concatenate([scan.angles[b] for scan, b in kept]) + lidar_yaw
+        angles = np.concatenate([scan.angles[beams] for scan, beams in kept]) + lidar_yaw
         p_body = np.column_stack([lidar_x + ranges * np.cos(angles), lidar_y + ranges * np.sin(angles)])
         poses = batch.tracks[self._primary].at(beam_ns)
         p_map = transform_each(poses, p_body)
-        drawn = (ranges > 0.0) & np.isfinite(p_map).all(axis=1)
+        drawn = (ranges > 0.0) & np.isfinite(p_map[:, 0]) & np.isfinite(p_map[:, 1])
         style = rr.Points2D.from_fields(colors=LIGHT, radii=screen(1.5), draw_order=15.0)
         self._entities.style("map/scan", style)
         columns = rr.Points2D.columns(positions=p_map[drawn])
-        lengths = np.bincount(row[drawn], minlength=len(beams))
+        lengths = np.bincount(row[drawn], minlength=len(kept))
         stamps_ns = np.array([scan.end_stamp_ns for scan in batch.scans])
         self._entities.columns("map/scan", stamps_ns, columns.partition(lengths))
         if self._grid is not None:
@@ -236,11 +236,6 @@ class MapScene:
         columns = rr.LineStrips2D.columns(strips=lines[drawn], colors=colours[drawn], labels=reasons[drawn])
         lengths = np.bincount(row[drawn], minlength=len(counts))
         self._entities.columns("map/ranges", stamps_ns, columns.partition(lengths))
-
-
-def _thin(count: int, most: int) -> IntArray:
-    """At most so many of `count` beams, evenly spread."""
-    return np.arange(0, count, -(-count // most)) if count else np.arange(0)
 
 
 def _thinned(xy: FloatArray) -> FloatArray:

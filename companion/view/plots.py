@@ -1,6 +1,5 @@
 """The time series of a scene: errors and sigmas, residuals and NIS, ages, rates and latency."""
 
-from collections import deque
 from itertools import cycle
 
 import numpy as np
@@ -33,7 +32,7 @@ class Plots:
         self._primary = next(iter(colours))
         self._sigmas: list[FloatArray] = []
         self._misses: list[FloatArray] = []
-        self._arrivals: dict[str, deque[int]] = {}
+        self._arrivals: dict[str, IntArray] = {}
         for i, colour in anchor_colours(config).items():
             style = rr.SeriesPoints(names=f"A{i}", colors=colour, markers="circle", marker_sizes=1.5)
             entities.static(f"ranges/residual/A{i}", style)
@@ -112,24 +111,26 @@ class Plots:
 
     def _send_sensors(self, batch: Batch) -> None:
         """How old the newest measurement of each kind was at every tick, and how many came in a second."""
-        kinds: dict[str, tuple[list[float], list[float]]] = {}
+        new: dict[str, tuple[list[int], list[int]]] = {}
         for i, tick in enumerate(batch.ticks):
             for outcome in tick.outcomes:
                 kind = _KINDS.get(type(outcome.measurement))
                 if kind is not None:
-                    stamp_ns = measurement_stamp_ns(outcome.measurement)
-                    self._arrivals.setdefault(kind, deque()).append(stamp_ns)
-            for kind, stamps_ns in self._arrivals.items():
-                while len(stamps_ns) > 1 and stamps_ns[0] <= tick.stamp_ns - RATE_OVER_NS:
-                    stamps_ns.popleft()
-                ages, rates = kinds.setdefault(kind, ([np.nan] * i, [np.nan] * i))
-                ages.append((tick.stamp_ns - stamps_ns[-1]) * 1e-6)
-                rates.append(sum(stamp_ns > tick.stamp_ns - RATE_OVER_NS for stamp_ns in stamps_ns))
+                    ticks, stamps = new.setdefault(kind, ([], []))
+                    ticks.append(i)
+                    stamps.append(measurement_stamp_ns(outcome.measurement))
         colours = dict(zip(_KINDS.values(), cycle(SENSORS), strict=False))
-        for kind, (ages, rates) in kinds.items():
-            colour = colours[kind]
-            self._entities.series(f"sensors/age/{kind}", kind, colour, batch.stamps_ns, np.array(ages))
-            self._entities.series(f"sensors/rate/{kind}", kind, colour, batch.stamps_ns, np.array(rates))
+        for kind in [*self._arrivals, *(kind for kind in new if kind not in self._arrivals)]:
+            ticks, stamps = new.get(kind, ([], []))
+            earlier = self._arrivals.get(kind, np.empty(0, np.int64))
+            stamps_ns = np.concatenate([earlier, np.array(stamps, np.int64)])
+            count = len(earlier) + np.searchsorted(ticks, np.arange(len(batch.ticks)), side="right")
+            old = np.searchsorted(stamps_ns, batch.stamps_ns - RATE_OVER_NS, side="right")
+            age = np.where(count > 0, (batch.stamps_ns - stamps_ns[count - 1]) * 1e-6, np.nan)
+            rate = np.where(count > 0, np.maximum(count - old, 0), np.nan)
+            self._entities.series(f"sensors/age/{kind}", kind, colours[kind], batch.stamps_ns, age)
+            self._entities.series(f"sensors/rate/{kind}", kind, colours[kind], batch.stamps_ns, rate)
+            self._arrivals[kind] = stamps_ns[min(old[-1], len(stamps_ns) - 1) :]
 
 
 def _percentile(values: FloatArray, share: float) -> float:

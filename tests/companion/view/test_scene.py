@@ -117,6 +117,30 @@ def distance_to(points: FloatArray, segment: FloatArray) -> FloatArray:
     return distances
 
 
+def test_evenly_spread_beams_are_drawn_and_none_without_a_return(run: Run, tmp_path: Path) -> None:
+    most = 70
+    config = run.config.model_copy(update={"view": run.config.view.model_copy(update={"scan_points": most})})
+    scans = run.measurements(Scan)
+    assert all(len(scan.ranges) > most and len(scan.ranges) % most for scan in scans)
+    view = RerunFiles(config, ["ekf"], tmp_path / "run.rrd", run.ticks[0][0].stamp_ns)
+    for tick, truth in run.ticks:
+        outcomes = [
+            replace(o, measurement=half_blind(o.measurement)) if isinstance(o.measurement, Scan) else o
+            for o in tick.outcomes
+        ]
+        view.tick(replace(tick, outcomes=outcomes), truth)
+    view.close()
+    drawn = [len(row) for row in read(tmp_path / "run.rrd")["map/scan"]["Points2D:positions"]]
+    assert len(drawn) == len(scans)
+    assert 0.7 * most / 2 < np.median(drawn) <= max(drawn) <= most / 2
+
+
+def half_blind(scan: Scan) -> Scan:
+    """A scan whose first half met nothing."""
+    count = len(scan.ranges)
+    return replace(scan, ranges=np.where(np.arange(count) < count / 2, 0.0, 3.0))
+
+
 def test_ranges_go_from_tag_to_anchor_in_the_colour_of_their_verdict(run: Run, recording: Recording) -> None:
     frames = run.measurements(RangeFrame)
     assert len(recording["map/ranges"]["LineStrips2D:strips"]) == len(frames)
@@ -151,6 +175,34 @@ def test_plots_hold_errors_residuals_nis_and_gate(run: Run, recording: Recording
     nis = [v for i in run.config.anchors for (v,) in recording[f"ranges/nis/A{i}"]["Scalars:scalars"]]
     accepted = run.verdicts("ekf").count(Verdict.ACCEPTED)
     assert accepted <= sum(value <= gate for value in nis) < len(nis)
+
+
+@pytest.mark.parametrize("batch", [7, 600])
+def test_while_a_port_stalls_its_sensor_ages_and_its_rate_falls_to_none(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, batch: int
+) -> None:
+    def stalling(i: int, tick: Tick, truth: Truth | None) -> tuple[Tick, Truth | None]:
+        held = [outcome for tick, _ in run.ticks[100:150] for outcome in tick.outcomes]
+        outcomes = [] if i < 40 or 100 <= i < 150 else held * (i == 150) + tick.outcomes
+        return replace(tick, outcomes=outcomes), truth
+
+    monkeypatch.setattr("companion.view.files.BATCH", batch)
+    recording = run.show(tmp_path / "run.rrd", change=stalling)
+    arrived: list[int] = []
+    ages, rates = [], []
+    for i, (original, truth) in enumerate(run.ticks):
+        tick, _ = stalling(i, original, truth)
+        arrived += [o.measurement.stamp_ns for o in tick.outcomes if isinstance(o.measurement, RangeFrame)]
+        ages.append((tick.stamp_ns - arrived[-1]) * 1e-6 if arrived else np.nan)
+        recent = sum(stamp_ns > tick.stamp_ns - 1_000_000_000 for stamp_ns in arrived)
+        rates.append(recent if arrived else np.nan)
+    assert np.isnan(rates[39])
+    assert rates[149] == 0 < rates[99]
+    for entity, expected in (("sensors/age/ranges", ages), ("sensors/rate/ranges", rates)):
+        drawn = [value for (value,) in recording[entity]["Scalars:scalars"]]
+        # Nothing is drawn of a batch before the first range.
+        np.testing.assert_allclose(drawn, expected[len(expected) - len(drawn) :], rtol=1e-12)
+        assert len(drawn) >= len(expected) - 40
 
 
 def test_a_lane_tells_what_became_of_most_ranges_of_an_anchor_in_half_a_second(
@@ -374,6 +426,8 @@ def test_small_batches_draw_what_one_large_one_draws(
         ("map/ranges", "LineStrips2D:strips"),
         ("error/position/ekf", "Scalars:scalars"),
         ("ranges/verdict/A1", "StateChange:state"),
+        ("sensors/age/increments", "Scalars:scalars"),
+        ("sensors/rate/ranges", "Scalars:scalars"),
     ):
         rows = [list(zip(r[entity]["time"], r[entity][component], strict=True)) for r in (small, recording)]
         assert str(rows[0]) == str(rows[1]), entity
