@@ -60,9 +60,11 @@ def ranges(
 
     All later runs and replays with that file take the bias off. A point file has the columns begin, end (of
     the stay, in seconds since the log began), x, y, z (of the tag's antenna, in metres). The site file
-    keeps its comments and its order. Of several tags on the robot (body.tags) truth calibrates all, points
-    and lidar the one at body.tag. Truth with a heading also tells what a tag's ranges add by the bearing of
-    the anchor in the body frame: it is kept where it is beyond noise.
+    keeps its comments and its order.
+
+    Of several tags on the robot (body.tags) truth calibrates all, points and lidar the one at body.tag; what
+    the others differ from it by stays. Truth with a heading also tells what a tag's ranges add by the bearing
+    of the anchor in the body frame: it is kept where it is beyond noise.
     """
     import numpy as np
 
@@ -72,7 +74,7 @@ def ranges(
     from companion.calibration.recording import read_recording
     from companion.calibration.reference import poses_from_truth, tags_from_points, tags_from_truth
     from companion.calibration.site_file import write_range_bias
-    from companion.calibration.tags import TagBias, fit_tags, without_tag_bias
+    from companion.calibration.tags import TagBias, carried_over, fit_tags, without_tag_bias
     from companion.config import load_config
     from companion.log import Log
 
@@ -80,6 +82,8 @@ def ranges(
     recording = read_recording(
         Log(log), config, until, with_odometry=against == "lidar", every_tag=against == "truth"
     )
+    frames = recording.range_frames
+    seen = {frame.tag_id for frame in frames}
     of_tags: dict[int, TagBias] = {}
     bearings: dict[int, BearingFit] = {}
     if against == "lidar":
@@ -88,7 +92,6 @@ def ranges(
         found = calibrate_on_drive(recording, config)
     else:
         anchors = {i: np.array(position) for i, position in config.anchors.items()}
-        frames = recording.range_frames
         if against == "truth":
             poses = poses_from_truth(recording)
             tags = tags_from_truth(recording, poses, config)
@@ -97,14 +100,15 @@ def ranges(
         else:
             tags = tags_from_points(Path(against), recording)
         of_tags = fit_tags(frames, tags, anchors, recording.start_ns)
-        # What an earlier drive said of a tag is replaced, though this one says nothing of it.
-        seen = {frame.tag_id for frame in frames} & config.range_bias.tags.keys()
-        of_tags = {i: TagBias(0.0, 0.0) for i in sorted(seen | bearings.keys())} | of_tags
         frames = [without_tag_bias(frame, of_tags) for frame in frames]
         by_anchor = ranges_by_anchor(frames, tags, anchors, recording.start_ns)
         if not by_anchor:
             raise UserError(f"{log}: no anchor has enough ranges where the position is known")
         found = fit_biases(by_anchor)
+    # What an earlier drive said of a tag is replaced, though this one says nothing of it.
+    known = {i: TagBias(row.constant, row.constant_sigma) for i, row in config.range_bias.tags.items()}
+    replaced = seen & known.keys() | bearings.keys()
+    of_tags = {i: TagBias(0.0, 0.0) for i in sorted(replaced)} | of_tags | carried_over(known, seen)
     out = result_console()
     out.print(_range_table(found, config))
     err, badly_seen = message_console(), _badly_seen(found)
@@ -119,7 +123,8 @@ def ranges(
         err.print(f"  picture {picture}")
         err.print("[red]nothing written: without known positions one hidden anchor spoils the bias of all[/]")
         raise typer.Exit(1)
-    write_range_bias(site, found, of_tags, bearings, to or site)
+    told = {i: bearings.get(i) for i in seen} if against == "truth" else {}
+    write_range_bias(site, found, of_tags, told, to or site)
     out.print(f"  common bias {found.common:+.4f} +- {found.common_sigma:.4f} m, {found.common_ns:+.2f} ns")
     for tag_id, bias in of_tags.items():
         out.print(f"  tag {tag_id} beyond that {bias.constant:+.4f} +- {bias.sigma:.4f} m")

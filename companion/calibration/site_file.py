@@ -19,7 +19,7 @@ def write_range_bias(
     site: Path,
     calibration: Calibration,
     tags: Mapping[int, TagBias],
-    bearings: Mapping[int, BearingFit],
+    bearings: Mapping[int, BearingFit | None],
     to: Path,
 ) -> None:
     """Put a calibration into the table `[range_bias]` of a site file.
@@ -28,7 +28,8 @@ def write_range_bias(
         site: file to read.
         calibration: what to write.
         tags: tag id -> bias beyond it.
-        bearings: tag id -> what depends on the bearing; of `tags` those that it lacks have none.
+        bearings: tag id -> what depends on the bearing, None if nothing does; what the file says of others
+            stays.
         to: file to write; may be the same.
 
     Raises:
@@ -51,10 +52,12 @@ def write_range_bias(
         of_tags = _table(table, "tags")
         for tag_id, bias in tags.items():
             row = tomlkit.inline_table()
+            if tag_id not in bearings:
+                row.update(of_tags.get(str(tag_id), {}))
             row["constant"] = round(bias.constant, 4)
             row["constant_sigma"] = round(bias.sigma, 4)
-            if tag_id in bearings:
-                of_bearing = bearings[tag_id]
+            of_bearing = bearings.get(tag_id)
+            if of_bearing is not None:
                 row["cosine"] = round(of_bearing.bias.cosine, 4)
                 row["cosine_sigma"] = round(of_bearing.cosine_sigma, 4)
                 row["sine"] = round(of_bearing.bias.sine, 4)

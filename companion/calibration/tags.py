@@ -1,7 +1,8 @@
 """Tags of one robot against each other: by how much longer the ranges of each are."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from math import hypot
 
 import numpy as np
 
@@ -15,7 +16,7 @@ class TagBias:
     """Bias of one tag's ranges, beyond those of the anchors.
 
     Attributes:
-        constant: [m]; those of all tags sum to zero.
+        constant: [m]; those of the tags that the anchors were calibrated with sum to zero.
         sigma: its standard deviation [m].
     """
 
@@ -58,6 +59,25 @@ def fit_tags(
     parts = (constants.mean(axis=1) - constants.mean()).tolist()
     sigmas = (np.sqrt(variances.sum(axis=1)) / len(shared)).tolist()
     return {name: TagBias(part, sigma) for name, part, sigma in zip(names, parts, sigmas, strict=True)}
+
+
+def carried_over(known: Mapping[int, TagBias], seen: Collection[int]) -> dict[int, TagBias]:
+    """What was known of tags that a new calibration of the anchors has not seen, beyond its biases.
+
+    The new biases of the anchors hold the mean of the tags that were seen. What the tags differ by stays.
+
+    Args:
+        known: beyond the biases of the anchors before, by tag id; a tag that is not in it has none.
+        seen: ids of the tags, at least one, with whose ranges the anchors were calibrated anew.
+    """
+    of_seen = [known.get(i, TagBias(0.0, 0.0)) for i in seen]
+    mean = sum(bias.constant for bias in of_seen) / len(of_seen)
+    mean_sigma = hypot(*(bias.sigma for bias in of_seen)) / len(of_seen)
+    return {
+        i: TagBias(bias.constant - mean, hypot(bias.sigma, mean_sigma))
+        for i, bias in known.items()
+        if i not in seen
+    }
 
 
 def without_tag_bias(frame: RangeFrame, biases: Mapping[int, TagBias]) -> RangeFrame:

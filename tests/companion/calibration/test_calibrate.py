@@ -111,15 +111,18 @@ def test_the_site_file_keeps_its_comments_and_takes_the_biases(log: Path, tmp_pa
     assert stored.range_bias.common_sigma > 0.0
     # Simulated ranges have no bias by bearing, so the single tag gets no row.
     assert not stored.range_bias.tags
-    # A second calibration replaces the first, and what another drive said of the tag.
+    # A second calibration replaces the first, and what another drive said of the tag. Of a tag that it has
+    # not seen there stays what it differs by.
     tag_id = read_recording(Log(log), stored, 1.0, with_odometry=False).range_frames[0].tag_id
     with site.open("a", encoding="utf-8") as file:
         file.write(f"[range_bias.tags]\n{tag_id} = {{ constant = 0.1, cosine = 0.05 }}\n")
+        file.write("77 = { constant = 0.3, constant_sigma = 0.01, cosine = 0.02 }\n")
     invoke("ranges", str(log), *options, "--until", "5")
     assert site.read_text(encoding="utf-8").count("common_sigma") == 1
     again = load_config(site).range_bias
     assert again.common != stored.range_bias.common
-    assert again.tags == {tag_id: TagBiasTable()}
+    other = TagBiasTable(constant=0.2, constant_sigma=0.01, cosine=0.02)
+    assert again.tags == {tag_id: TagBiasTable(), 77: other}
 
 
 def test_a_hidden_anchor_lets_nothing_be_written_that_was_found_against_the_lidar(

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from companion.calibrate_cli import app
 from companion.calibration.recording import read_recording
 from companion.calibration.reference import poses_from_truth, tags_from_truth
-from companion.calibration.tags import fit_tags
+from companion.calibration.tags import carried_over, fit_tags
 from companion.config import Config, load_config
 from companion.errors import UserError
 from companion.importers.sources import import_log
@@ -195,6 +195,20 @@ def test_what_a_tag_adds_to_every_anchor_is_found_as_well_as_claimed() -> None:
         found = fit_tags(frames, np.array(tags), ANCHORS, 0)
         assert list(found) == list(true)
         squares += [((found[i].constant - bias) / found[i].sigma) ** 2 for i, bias in true.items()]
+    assert 0.5 < np.mean(squares) < 2.0
+
+
+@pytest.mark.parametrize("seen", [{4}, {4, 9}])
+def test_tags_that_a_later_calibration_has_not_seen_keep_what_they_differ_by(seen: set[int]) -> None:
+    # The anchors' biases hold the mean of the tags that were seen then.
+    true = {4: 0.06, 7: -0.04, 9: 0.01}
+    squares = []
+    for seed in range(20):
+        frames, tags = zip(*drive(true, seed), strict=True)
+        kept = carried_over(fit_tags(frames, np.array(tags), ANCHORS, 0), seen)
+        assert kept.keys() == true.keys() - seen
+        held = np.mean([true[i] for i in seen])
+        squares += [((bias.constant - (true[i] - held)) / bias.sigma) ** 2 for i, bias in kept.items()]
     assert 0.5 < np.mean(squares) < 2.0
 
 
