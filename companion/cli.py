@@ -24,7 +24,7 @@ from companion.scenario_cli import demo, emulate, simulate
 from companion.site_cli import dump_config, plan
 from companion.sitl_cli import sitl
 from companion.smooth_cli import smooth
-from companion.terminal import message_console, result_console
+from companion.terminal import flow_help, message_console, result_console
 
 EXIT_BAD_INPUT = 2
 
@@ -79,6 +79,7 @@ app.add_typer(doctor, name="doctor")
 app.add_typer(params_app, name="params")
 app.add_typer(calibrate_app, name="calibrate")
 app.add_typer(evaluate_app, name="evaluate", cls=_ScenarioUnlessNamed)
+flow_help(app)
 
 
 def main() -> NoReturn:

@@ -64,10 +64,18 @@ def edit(
     """Write a log as it would be had something gone wrong: what if anchor 3 dies at 20 s?
 
     [bold]companion edit raw.mcap --fault drop:anchor=3,at=20 --out what_if.mcap[/], then replay what_if.mcap.
-    Every fault has at= and for= [s]. silent (sensor), late (sensor, by [s]), drop (anchor), spike (anchor,
-    size [m], share), nlos (anchor, least, mean [m]), moved (anchor, x, y, z [m]; needs truth), clock (by [s]:
-    the tag's clock jumps), rotated (yaw_deg: the tag in its mount), blocked (from_deg, to_deg, distance: a
-    sector of the LiDAR), gone (share of LiDAR beams without return).
+
+    Every fault has at= and for= (seconds), lengths are in metres, and:
+    - silent: sensor
+    - late: sensor, by (seconds)
+    - drop: anchor
+    - spike: anchor, size, share
+    - nlos: anchor, least, mean
+    - moved: anchor, x, y, z; needs truth
+    - clock: by (seconds), the tag's clock jumps
+    - rotated: yaw_deg, the tag in its mount
+    - blocked: from_deg, to_deg, distance, a sector of the LiDAR
+    - gone: share of LiDAR beams without return
     """
     from companion.log import Log
     from companion.log_edit.edit import edit_log

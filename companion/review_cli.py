@@ -92,10 +92,10 @@ def review(
     begun = time.perf_counter()
     with progress(err) as shown:
         bar = shown.add_task("review", total=1.0)
+        reviews = review_logs(
+            opened, names, Span(begin, end), stream, lambda share: shown.update(bar, completed=share)
+        )
         try:
-            reviews = review_logs(
-                opened, names, Span(begin, end), stream, lambda share: shown.update(bar, completed=share)
-            )
             stream.flush()
         except RuntimeError as error:
             where = f"cannot write {save}" if save is not None else "the viewer was closed"

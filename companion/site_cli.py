@@ -22,11 +22,12 @@ def plan(
         typer.Option("--scenario", metavar="NAME", help="Take furniture from the boxes of this scenario."),
     ] = None,
     limit: Annotated[
-        float, typer.Option("--limit", min=0.001, metavar="M", help="Position error that is still good [m].")
+        float,
+        typer.Option("--limit", min=0.001, metavar="M", help="Position error that is still good, in metres."),
     ] = 0.2,
     sigma: Annotated[
         float | None,
-        typer.Option("--sigma", min=0.001, metavar="M", help="Range noise [m]; default: that of ekf."),
+        typer.Option("--sigma", min=0.001, metavar="M", help="Range noise in metres; default: that of ekf."),
     ] = None,
     folder: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for plan.png.")] = Path(
         "out/plan"

@@ -1,5 +1,7 @@
 """What the commands share: results go to stdout, progress and messages to stderr; options of several."""
 
+import re
+from inspect import cleandoc
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -66,6 +68,19 @@ def progress(console: Console, *, counts: bool = False) -> Progress:
         transient=True,
         disable=not console.is_terminal,
     )
+
+
+def flow_help(app: typer.Typer) -> None:
+    """Let paragraphs of commands' help wrap where the terminal ends, not where their source does.
+
+    A line that begins with a dash stays one.
+    """
+    for command in app.registered_commands:
+        paragraphs = cleandoc((command.callback and command.callback.__doc__) or "").split("\n\n")
+        command.help = "\n\n".join(re.sub(r"\n(?!- )", " ", paragraph) for paragraph in paragraphs)
+    for group in app.registered_groups:
+        if group.typer_instance is not None:
+            flow_help(group.typer_instance)
 
 
 def shown_where(view: str) -> "Shown":

@@ -77,28 +77,6 @@ def test_dump_config(command: Command, tmp_path: Path) -> None:
     assert "rate = 15.0" in done.stdout
 
 
-@pytest.mark.parametrize(
-    "words",
-    [
-        [],
-        ["demo"],
-        ["run"],
-        ["simulate"],
-        ["emulate"],
-        ["replay"],
-        ["evaluate"],
-        ["evaluate", "scenario"],
-        ["dump-config"],
-        ["doctor"],
-        ["doctor", "ports"],
-    ],
-)
-def test_help_teaches(command: Command, words: list[str]) -> None:
-    done = command(*words, "--help")
-    assert done.returncode == 0
-    assert len(done.stdout.splitlines()) > 8
-
-
 def test_the_version_is_told(command: Command) -> None:
     assert command("--version").stdout.strip() == __version__
 
