@@ -10,7 +10,7 @@ from rich.table import Table
 
 from companion.errors import UserError
 from companion.shipped_files import named_file
-from companion.terminal import message_console, result_console
+from companion.terminal import LogPath, message_console, result_console
 
 if TYPE_CHECKING:
     from companion.calibration.bearings import BearingFit
@@ -24,7 +24,6 @@ app = typer.Typer(
     help="Find out from a drive what the sensors do wrong.", no_args_is_help=True, rich_markup_mode="rich"
 )
 
-Log_ = Annotated[Path, typer.Argument(metavar="LOG", help="Log (MCAP) of the drive.")]
 Site = Annotated[Path, typer.Option("--site", metavar="FILE", help="Site file of the drive.")]
 Until = Annotated[
     float | None,
@@ -35,7 +34,7 @@ Json = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write
 
 @app.command()
 def ranges(
-    log: Log_,
+    log: LogPath,
     site: Site,
     against: Annotated[
         str,
@@ -144,7 +143,7 @@ def ranges(
 
 
 @app.command()
-def mounting(log: Log_, site: Site, until: Until = None, figures: Json = None) -> None:
+def mounting(log: LogPath, site: Site, until: Until = None, figures: Json = None) -> None:
     """Find where the UWB tag sits on the robot and how late its ranges are stamped, against the LiDAR.
 
     The drive must turn, both ways best: what a turn does not show of the tag's place, nothing shows. Range

@@ -12,6 +12,7 @@ from companion.mavlink.session import MavlinkSession
 from companion.pipeline import Chain, Tick, make_pipeline
 from companion.plots import figure
 from companion.replay import Replay, config_of, replay, write_outputs
+from companion.run_folder import RAW_LOG
 from companion.sim.autopilot import EmulatedAutopilot
 from companion.sim.scenario import Scenario
 from companion.sim.simulate import START_NS, record
@@ -55,7 +56,7 @@ def run_demo(scenario: Scenario, folder: Path, progress: Progress) -> tuple[Repl
         UserError: the folder cannot be written.
     """
     autopilot = EmulatedAutopilot()
-    path = folder / "raw.mcap"
+    path = folder / RAW_LOG
     for share in _fly(scenario, path, autopilot):
         progress("walk", share)
     progress("walk", 1.0)

@@ -13,6 +13,7 @@ import typer
 
 from companion.alignment import Alignment
 from companion.errors import UserError
+from companion.run_folder import log_in
 from companion.shipped_files import named_file
 from companion.terminal import Seed, Sets, message_console, progress, result_console
 
@@ -166,9 +167,11 @@ def _print(result: "Evaluation", out: "Console") -> None:
 
 
 def _imported(path: Path, sets: list[str]) -> Path:
-    """The source itself, or for the folder of a data set the log that is made of it."""
+    """The source itself, the log of a run's folder, or for that of a data set the log that is made of it."""
     if not path.is_dir():
         return path
+    if log_in(path).exists():
+        return log_in(path)
     from companion.importers.sources import import_log
 
     folder = mkdtemp(prefix="companion-")
@@ -218,7 +221,7 @@ def _write_report(
     log = write_worst_trial(newest, path, folder, sets, faults)
     if log is not None:
         lines.append(f"worst trial of {newest.decisive}, seed {newest.worst_seed()}: {log}")
-        lines.append(f"look at it: companion replay {log}, then rerun out/{log.stem}/replay.rrd")
+        lines.append(f"look at it: companion review {log}")
     return lines
 
 

@@ -25,6 +25,7 @@ from companion.mavlink.signing import SigningClock, read_key
 from companion.pipeline import Chain, Tick, make_pipeline
 from companion.range_log import HEADER, range_lines
 from companion.replay import tum_line
+from companion.run_folder import RAW_LOG
 from companion.view.drawing import Item
 from companion.view.line import Line
 from companion.view.live_view import LiveView
@@ -118,7 +119,7 @@ class LiveRun:
         self._anchors_due_ns = self._start_ns + ANCHORS_PERIOD_NS
         if view != "off":
             check_viewer(view, config.view)
-        self._log = LogWriter(folder / "raw.mcap", config.to_toml(), self._start_ns)
+        self._log = LogWriter(folder / RAW_LOG, config.to_toml(), self._start_ns)
         try:
             (folder / "config.toml").write_text(config.to_toml(), encoding="utf-8")
             self._poses = (folder / "poses.tum").open("w", encoding="utf-8", buffering=1)

@@ -7,11 +7,11 @@ import typer
 
 from companion.errors import UserError
 from companion.shipped_files import named_file
-from companion.terminal import Seed, Sets, message_console, progress, result_console
+from companion.terminal import LogPath, Seed, Sets, message_console, progress, result_console
 
 
 def make_map(
-    log: Annotated[Path, typer.Argument(metavar="LOG", help="Log (MCAP) of a run, demo or simulation.")],
+    log: LogPath,
     out_file: Annotated[
         Path, typer.Option("--out", metavar="FILE", help="Map (YAML) to write, with a PNG beside it.")
     ] = Path("map.yaml"),
@@ -53,7 +53,7 @@ def make_map(
 
 
 def edit(
-    log: Annotated[Path, typer.Argument(metavar="LOG", help="Log (MCAP) to read.")],
+    log: LogPath,
     fault: Annotated[
         list[str],
         typer.Option("--fault", metavar="KIND:KEY=VALUE,...", help="What goes wrong. Repeatable."),
@@ -120,7 +120,7 @@ def import_recording(
 
 
 def export(
-    log: Annotated[Path, typer.Argument(metavar="LOG", help="Log (MCAP).")],
+    log: LogPath,
     folder: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to write.")],
 ) -> None:
     """Write what a log holds as text: ranges.csv, scans.csv, imu.csv, truth.tum."""

@@ -5,10 +5,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from rich.padding import Padding
 
 from companion.errors import UserError
+from companion.run_folder import folder_for
 from companion.shipped_files import named_file
-from companion.terminal import Sets, message_console, progress, result_console
+from companion.terminal import INDENT, LogPath, Sets, message_console, progress, result_console
 
 if TYPE_CHECKING:
     from companion.config import Config
@@ -18,7 +20,7 @@ out, err = result_console(), message_console()
 
 
 def replay(
-    log: Annotated[Path, typer.Argument(metavar="LOG", help="Log (MCAP) of a run, demo or simulation.")],
+    log: LogPath,
     estimator: Annotated[
         list[str] | None,
         typer.Option(
@@ -26,7 +28,7 @@ def replay(
         ),
     ] = None,
     folder: Annotated[
-        Path | None, typer.Option("--out", metavar="DIR", help="Folder to write; default out/LOGNAME.")
+        Path | None, typer.Option("--out", metavar="DIR", help="Folder to write; default out/NAME-replay.")
     ] = None,
     site: Annotated[
         Path | None,
@@ -67,7 +69,7 @@ def replay(
     if mavlink is not None:
         _play(opened, config, names[0], speed)
         return
-    folder = folder or Path("out") / log.stem
+    folder = folder or folder_for(log, "replay")
     view = RerunFiles(config, names, folder / "replay.rrd", opened.start_ns)
     begin = time.perf_counter()
     with progress(err) as shown:
@@ -90,9 +92,9 @@ def replay(
     out.print(accuracy_table(result, title + ("" if result.errors else ", no truth in the log")))
     out.print(anchor_table(result))
     for line in sensor_lines(result):
-        out.print(f"  {line}")
+        out.print(Padding(line, INDENT, expand=False))
     out.print(
-        f"  written to {folder}: poses.tum, ranges.csv, summary.json, config.toml, replay.rrd",
+        f"  written to {folder}: poses.tum, ranges.csv, summary.json, config.toml, replay.rrd", soft_wrap=True
     )
 
 

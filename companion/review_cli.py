@@ -10,6 +10,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from companion.errors import UserError
+from companion.run_folder import log_in
 from companion.terminal import message_console, progress, result_console
 
 if TYPE_CHECKING:
@@ -82,7 +83,7 @@ def review(
             raise UserError(f"--estimator: unknown estimator {name!r}, there are: {', '.join(ESTIMATORS)}")
     opened: list[tuple[Log, Config]] = []
     for path in logs:
-        log = Log(path / "raw.mcap" if path.is_dir() else path)
+        log = Log(log_in(path))
         opened.append((log, load_config(site, sets or []) if site else config_of(log, sets or [])))
 
     from companion.review import Span

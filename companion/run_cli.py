@@ -11,6 +11,7 @@ import typer
 from rich.markup import escape
 
 from companion.interrupt import set_by_signals
+from companion.run_folder import RAW_LOG
 from companion.shipped_files import named_file
 from companion.terminal import Sets, View, message_console, shown_where
 
@@ -58,12 +59,12 @@ def run(
 
     with set_by_signals() as stop:
         live = LiveRun(config, folder, say, view=shown_where(view))
-        say(f"{config.site.name}: estimator {config.pipeline.estimator}, log {folder / 'raw.mcap'}")
+        say(f"{config.site.name}: estimator {config.pipeline.estimator}, log {folder / RAW_LOG}")
         reporter = threading.Thread(target=_report, args=(live, stop), daemon=True)
         reporter.start()
         live.run(stop)
         reporter.join()
-    say(f"ended: {live.status.poses_sent} poses sent; replay with: companion replay {folder / 'raw.mcap'}")
+    say(f"ended: {live.status.poses_sent} poses sent; replay with: companion replay {folder}")
 
 
 def _report(live: "LiveRun", stop: threading.Event) -> None:

@@ -6,11 +6,22 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from rich.padding import Padding
 
 from companion.errors import UserError
 from companion.interrupt import set_by_signals
+from companion.run_folder import RAW_LOG
 from companion.shipped_files import named_file
-from companion.terminal import Seed, Sets, View, message_console, progress, result_console, shown_where
+from companion.terminal import (
+    INDENT,
+    Seed,
+    Sets,
+    View,
+    message_console,
+    progress,
+    result_console,
+    shown_where,
+)
 
 if TYPE_CHECKING:
     from companion.sim.scenario import Scenario
@@ -51,7 +62,7 @@ def demo(
     out.print(accuracy_table(result, f"{result.duration:.0f} s against truth, seed {loaded.seed}"))
     out.print(anchor_table(result))
     for line in sensor_lines(result):
-        out.print(f"  {line}")
+        out.print(Padding(line, INDENT, expand=False))
     definite = "all" if received.all_positive_definite else "NOT ALL"
     out.print(
         f"  autopilot: {received.poses} poses at {received.rate:.1f} Hz, {received.heartbeats} heartbeats, "
@@ -61,7 +72,7 @@ def demo(
     out.print(f"  replay: repeats the poses sent to {received.replay_difference * 1000:.3f} mm")
     out.print()
     out.print(f"  picture  {folder / 'demo.png'}")
-    out.print(f"  log      {folder / 'raw.mcap'}")
+    out.print(f"  log      {folder / RAW_LOG}")
     out.print(f"  review   companion review {folder}")
     if where != "off":
         from companion.view.viewer import Viewer

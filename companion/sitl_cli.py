@@ -10,6 +10,7 @@ import typer
 from rich.markup import escape
 
 from companion.interrupt import set_by_signals
+from companion.run_folder import RAW_LOG
 from companion.shipped_files import named_file
 from companion.terminal import message_console, result_console
 
@@ -72,6 +73,6 @@ def sitl(
         out.print(f"companion: {len(errors)} poses, RMSE {rmse:.3f} m, max {errors.max():.3f} m")
     for line in run.score.lines():
         out.print(line, markup=False, soft_wrap=True)
-    out.print(f"log: {folder / 'raw.mcap'}", soft_wrap=True)
+    out.print(f"log: {folder / RAW_LOG}", soft_wrap=True)
     if not run.score.errors:
         raise typer.Exit(EXIT_NOT_FOLLOWED)

@@ -8,15 +8,16 @@ import typer
 from rich.table import Table
 
 from companion.errors import UserError
+from companion.run_folder import folder_for
 from companion.shipped_files import named_file
-from companion.terminal import Sets, message_console, progress, result_console
+from companion.terminal import LogPath, Sets, message_console, progress, result_console
 
 if TYPE_CHECKING:
     from companion.smooth import SmoothedLog
 
 
 def smooth(
-    log: Annotated[Path, typer.Argument(metavar="LOG", help="Log (MCAP) of a run, demo or simulation.")],
+    log: LogPath,
     site: Annotated[
         Path | None,
         typer.Option("--site", metavar="FILE", help="Site file instead of the log's own settings."),
@@ -26,7 +27,7 @@ def smooth(
         bool, typer.Option("--biases", help="Find how much too long each anchor's ranges are, too.")
     ] = False,
     folder: Annotated[
-        Path | None, typer.Option("--out", metavar="DIR", help="Folder to write; default out/LOGNAME-smooth.")
+        Path | None, typer.Option("--out", metavar="DIR", help="Folder to write; default out/NAME-smooth.")
     ] = None,
     sets: Sets = None,
 ) -> None:
@@ -47,7 +48,7 @@ def smooth(
     out, err = result_console(), message_console()
     opened = Log(log)
     config = load_config(named_file(site, "sites"), sets or []) if site else config_of(opened, sets or [])
-    folder = folder or Path("out") / f"{log.stem}-smooth"
+    folder = folder or folder_for(log, "smooth")
     with progress(err) as shown:
         bar = shown.add_task(log.name, total=1.0)
         found = smooth_log(opened, config, anchors, biases, lambda share: shown.update(bar, completed=share))

@@ -2,6 +2,7 @@
 
 import re
 from inspect import cleandoc
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -16,10 +17,17 @@ from rich.progress import (
 )
 
 from companion.errors import UserError
+from companion.run_folder import log_in
 
 if TYPE_CHECKING:
     from companion.view.viewer import Shown
 
+LogPath = Annotated[
+    Path,
+    typer.Argument(
+        metavar="LOG|RUN", help="Log (MCAP), or folder of a run, demo or simulation.", callback=log_in
+    ),
+]
 Seed = Annotated[
     int | None, typer.Option("--seed", min=0, metavar="N", help="Instead of the scenario's own seed.")
 ]
@@ -40,6 +48,9 @@ View = Annotated[
         "computer) or off. `run` and `emulate` show it while it runs.",
     ),
 ]
+
+INDENT = (0, 0, 0, 2)
+"""Padding of lines below a table, folded ones too."""
 
 
 def result_console() -> Console:

@@ -43,11 +43,18 @@ def test_simulate_then_replay(command: Command, tmp_path: Path) -> None:
     names = ("--estimator", "least_squares", "--estimator", "ekf")
     done = command("replay", "a.mcap", *names, "--set", "pipeline.rate=10")
     assert done.returncode == 0, done.stderr
-    folder = tmp_path / "out" / "a"
+    folder = tmp_path / "out" / "a-replay"
     assert json.loads((folder / "summary.json").read_text())["primary"] == "least_squares"
     assert "rate = 10" in (folder / "config.toml").read_text()
     assert (folder / "poses_ekf.tum").exists()
     assert (folder / "replay.rrd").stat().st_size > 10_000
+
+    (tmp_path / "walk").mkdir()
+    (tmp_path / "b.mcap").rename(tmp_path / "walk" / "raw.mcap")
+    done = command("replay", "walk", *names, "--set", "pipeline.rate=10")
+    assert done.returncode == 0, done.stderr
+    again = tmp_path / "out" / "walk-replay" / "poses.tum"
+    assert again.read_bytes() == (folder / "poses.tum").read_bytes()
 
     (tmp_path / "moved.toml").write_text(SITE_TEXT.replace("0.15, 6.85, 2.0", "0.15, 4.85, 2.0"))
     done = command("replay", "a.mcap", "--site", "moved.toml", "--out", "moved")
@@ -137,6 +144,7 @@ BAD_INPUT = {
         ["emulate", "moon"],
         "no file moon and none of that name in params/scenarios; there are: ",
     ),
+    "folder without a log": (["replay", "."], "cannot read raw.mcap"),
     "unwritable log": (["simulate", "square_room", "--out", "text.mcap/log"], "cannot write the log"),
     "unwritable folder": (["demo", "--out", "text.mcap/demo"], "cannot write the log"),
     "set without site": (["dump-config", "--set", "a=1"], "--set: give --site too"),
