@@ -121,8 +121,10 @@ def _stream(
 
     from companion.view.files import APPLICATION
     from companion.view.files import save as save_to
-    from companion.view.viewer import Viewer, free_port
+    from companion.view.viewer import Viewer, free_port, has_screen
 
+    if save is None and not web and not has_screen():
+        raise UserError("this computer has no screen (DISPLAY is not set); use --web or --save FILE")
     stream = rr.RecordingStream(APPLICATION, recording_id=uuid4())
     stream_name = config.site.name
     if save is not None:

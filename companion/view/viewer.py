@@ -111,13 +111,18 @@ class Viewer:
         self._process.wait()
 
 
+def has_screen() -> bool:
+    """Whether this computer can open a window."""
+    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
 def check_viewer(mode: Mode, table: ViewTable) -> None:
     """Whether a viewer can be started.
 
     Raises:
         UserError: no screen for a window, or a port is in use.
     """
-    if mode == "native" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+    if mode == "native" and not has_screen():
         raise UserError("--view native: this computer has no screen (DISPLAY is not set); use --view web")
     _check_port(_address(mode, table), table.data_port, "view.data_port")
     if mode == "web":

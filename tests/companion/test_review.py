@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import pytest
 from rerun.chunk import RrdReader
 
 from tests.conftest import Command
@@ -48,11 +49,16 @@ BAD_CALLS = {
     "after the end": (["LOG", "--from", "900", "--save", "x.rrd"], "--from 900: "),
     "unknown estimator": (["LOG", "--estimator", "ekf,magic"], "--estimator: unknown estimator 'magic'"),
     "file and page": (["LOG", "--save", "x.rrd", "--web"], "--save and --web: a file is not served"),
+    "no screen": (["LOG"], "this computer has no screen (DISPLAY is not set); use --web or --save FILE"),
     "no log": (["gone.mcap"], "cannot read gone.mcap: No such file or directory"),
 }
 
 
-def test_bad_calls_are_one_line_and_exit_code_2(command: Command, short_log: Path, tmp_path: Path) -> None:
+def test_bad_calls_are_one_line_and_exit_code_2(
+    command: Command, short_log: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     for arguments, said in BAD_CALLS.values():
         words = [str(short_log) if word == "LOG" else word for word in arguments]
         done = command("review", *words)
