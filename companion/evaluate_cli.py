@@ -13,7 +13,7 @@ import typer
 
 from companion.alignment import Alignment
 from companion.errors import UserError
-from companion.run_folder import log_in
+from companion.run_folder import log_in, log_name
 from companion.shipped_files import named_file
 from companion.terminal import Seed, Sets, message_console, progress, result_console
 
@@ -112,7 +112,7 @@ def scenario(
     for path, faults in _runs(paths, fault or [], sets or []):
         with progress(err, counts=True) as shown:
             count = 1 if path.suffix == LOG_SUFFIX and not faults else trials
-            bar = shown.add_task(" ".join([path.stem, *faults]), total=count)
+            bar = shown.add_task(" ".join([log_name(path), *faults]), total=count)
             results.append(
                 evaluate_scenario(
                     path,
@@ -129,7 +129,7 @@ def scenario(
             )
         result = results[-1]
         if is_library:
-            by_fault.setdefault(path.stem, {})[" ".join(faults)] = result
+            by_fault.setdefault(log_name(path), {})[" ".join(faults)] = result
         else:
             _print(result, out)
         if folder is not None:

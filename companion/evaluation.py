@@ -24,6 +24,7 @@ from companion.log_edit.faults import parse_fault
 from companion.log_trial import LOG_SUFFIX, log_config, run_log_trial
 from companion.metrics import chi2_mean_bounds
 from companion.range_score import pooled
+from companion.run_folder import log_name
 from companion.sim.scenario import load_scenario
 from companion.sim.scenario_tables import PaperTable
 from companion.trial import run_trial
@@ -189,7 +190,7 @@ def evaluate_scenario(
     """
     names = list(dict.fromkeys(choices))
     if path.suffix == LOG_SUFFIX:
-        config, name, paper, seeds = log_config(path, sets), path.stem, None, range(1)
+        config, name, paper, seeds = log_config(path, sets), log_name(path), None, range(1)
         trial: Trial = partial(run_log_trial, path, sets=list(sets), choices=names, alignment=alignment)
     else:
         scenario = load_scenario(path, seed, list(sets))

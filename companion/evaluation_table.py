@@ -171,7 +171,8 @@ def _leg_names(result: Evaluation) -> tuple[str, ...]:
 
 
 def _title(result: Evaluation) -> str:
-    return f"{result.scenario}: means of {result.trials} trials"
+    trials = "one trial" if result.trials == 1 else f"means of {result.trials} trials"
+    return f"{result.scenario}: {trials}"
 
 
 def _table(title: str, headings: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:

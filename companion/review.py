@@ -10,6 +10,7 @@ from companion.events import Event, worst_error
 from companion.log import Log, RawChunk, Truth
 from companion.pipeline import Tick
 from companion.replay import Replay, replay
+from companion.run_folder import log_name
 from companion.view.blueprint import REVIEW_TRAIL, comparison_blueprint, run_blueprint
 from companion.view.files import BATCH
 from companion.view.scene import Scene
@@ -79,7 +80,7 @@ def review(
 
     for i, (log, config) in enumerate(logs):
         chosen = list(names or [config.pipeline.estimator])
-        root, title = (f"{ROOTS[i]}/", f"{ROOTS[i]} {log.path.stem}") if len(logs) > 1 else ("", "")
+        root, title = (f"{ROOTS[i]}/", f"{ROOTS[i]} {log_name(log.path)}") if len(logs) > 1 else ("", "")
         scene = Scene(config, chosen, stream, log.start_ns, root, title)
         scenes.append(scene)
 

@@ -11,7 +11,11 @@ def log_in(path: Path) -> Path:
     return path / RAW_LOG if path.is_dir() else path
 
 
+def log_name(log: Path) -> str:
+    """Name of a log: that of its file, or of the run that it is the log of."""
+    return log.resolve().parent.name if log.name == RAW_LOG else log.stem
+
+
 def folder_for(log: Path, what: str) -> Path:
-    """Folder for what is made of a log, named after it, or after the run that it is the log of."""
-    name = log.resolve().parent.name if log.name == RAW_LOG else log.stem
-    return Path("out") / f"{name}-{what}"
+    """Folder for what is made of a log."""
+    return Path("out") / f"{log_name(log)}-{what}"

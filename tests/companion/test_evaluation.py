@@ -355,7 +355,7 @@ def test_options_may_come_first(tmp_path: Path, command: Command) -> None:
     path = write_scenario(tmp_path, STRAIGHT_ON, FEW)
     done = command("evaluate", "--trials", "1", "--workers", "1", "--estimators", "lidar", path)
     assert done.returncode == 0, done.stderr
-    assert "scenario: means of 1 trials" in done.stdout
+    assert "scenario: one trial" in done.stdout
 
 
 @pytest.mark.parametrize(

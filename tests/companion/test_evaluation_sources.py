@@ -211,7 +211,7 @@ def test_the_command_takes_several_sources_and_writes_one_report(
     assert (first["scenario"], first["trials"]) == ("scenario", 2)
     assert (second["scenario"], second["trials"]) == ("short", 1)
     report = (tmp_path / "o" / "report.md").read_text()
-    assert report.index("## scenario: means of 2 trials") < report.index("## short: means of 1 trials")
+    assert report.index("## scenario: means of 2 trials") < report.index("## short: one trial")
     assert {p.name for p in (tmp_path / "o").iterdir()} == {
         "f.json",
         "report.md",

@@ -278,7 +278,7 @@ def test_the_robot_with_a_laser_is_evaluated_by_one_command(tmp_path: Path) -> N
     (folder / "x_ref_scanmatch.csv").write_text("# head\n" + "".join(f"{99 + k},0,0,0\n" for k in range(13)))
     done = companion(folder, "--estimators", "ekf", "--workers", "1", "--json", "f.json", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    assert "made up: means of 1 trials" in done.stdout
+    assert "made up: one trial" in done.stdout
     figures = json.loads((tmp_path / "f.json").read_text())["estimators"]["ekf"]
     assert figures["rmse_m"] < 0.1
     assert figures["yaw_rmse_deg"] < 2.0
