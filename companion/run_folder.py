@@ -13,7 +13,7 @@ def log_in(path: Path) -> Path:
 
 def log_name(log: Path) -> str:
     """Name of a log: that of its file, or of the run that it is the log of."""
-    return log.resolve().parent.name if log.name == RAW_LOG else log.stem
+    return log.parent.resolve().name if log.name == RAW_LOG else log.stem
 
 
 def folder_for(log: Path, what: str) -> Path:

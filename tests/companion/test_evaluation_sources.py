@@ -201,22 +201,25 @@ def test_markdown_has_a_cell_for_every_heading(result: Evaluation) -> None:
 def test_the_command_takes_several_sources_and_writes_one_report(
     walk: Path, short_log: Path, tmp_path: Path
 ) -> None:
+    run = tmp_path / "run-7"
+    run.mkdir()
+    (run / "raw.mcap").symlink_to(short_log)
     done = companion(
-        *(walk, short_log, "--trials", "2", "--workers", "1", "--estimators", "ekf"),
+        *(walk, run, "--trials", "2", "--workers", "1", "--estimators", "ekf"),
         *("--out", "o", "--json", "o/f.json"),
         cwd=tmp_path,
     )
     assert done.returncode == 0, done.stderr
     first, second = json.loads((tmp_path / "o" / "f.json").read_text())
     assert (first["scenario"], first["trials"]) == ("scenario", 2)
-    assert (second["scenario"], second["trials"]) == ("short", 1)
+    assert (second["scenario"], second["trials"]) == ("run-7", 1)
     report = (tmp_path / "o" / "report.md").read_text()
-    assert report.index("## scenario: means of 2 trials") < report.index("## short: one trial")
+    assert report.index("## scenario: means of 2 trials") < report.index("## run-7: one trial")
     assert {p.name for p in (tmp_path / "o").iterdir()} == {
         "f.json",
         "report.md",
         "scenario.png",
-        "short.png",
+        "run-7.png",
     }
     assert "…" not in done.stdout
 
