@@ -39,7 +39,8 @@ def fault_markdown(name: str, results: Mapping[str, Evaluation]) -> str:
 
 def _title(name: str, results: Mapping[str, Evaluation]) -> str:
     trials = max(result.trials for result in results.values())
-    return f"{name}, {trials} trials a fault: RMSE m / healthy poses beyond 3 sigma, %"
+    count = "one trial" if trials == 1 else f"{trials} trials"
+    return f"{name}, {count} a fault: RMSE m / healthy poses beyond 3 sigma, %"
 
 
 def _headings(results: Mapping[str, Evaluation]) -> list[str]:

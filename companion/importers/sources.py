@@ -1,5 +1,7 @@
 """Which of the formats a file or folder is in, and the log that is made of it."""
 
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from companion.config import Config, load_config
@@ -39,23 +41,26 @@ def import_log(
         UserError: the format is none of these, the site is missing, or something in it is wrong.
     """
     name = data_set_in(source) if source.is_dir() else None
+    read = _reader(source, name, truth)
     if site is None:
         if name is None:
             raise UserError(f"{source}: give --site FILE, the recording does not say where its anchors stand")
         site = params_dir() / "sites" / f"{name}.toml"
     config = load_config(site, sets or [])
-    return write_recording(_read(source, name, config, truth), config, path)
+    return write_recording(read(config), config, path)
 
 
-def _read(source: Path, name: str | None, config: Config, truth: str | None) -> Recording:
+def _reader(source: Path, name: str | None, truth: str | None) -> Callable[[Config], Recording]:
+    if not source.exists():
+        raise UserError(f"cannot read {source}: No such file or directory")
     if name is not None:
-        return DATA_SETS[name][1](source, config)
+        return partial(DATA_SETS[name][1], source)
     if source.suffix in _CARMEN:
-        return read_carmen(source)
+        return lambda _: read_carmen(source)
     if source.suffix in _BAGS or (source / _ROS2_FOLDER).exists():
-        return read_bag(source, truth)
+        return lambda _: read_bag(source, truth)
     if any((source / file).exists() for file in (RANGES, SCANS, INERTIAL)):
-        return read_folder(source)
+        return lambda _: read_folder(source)
     raise UserError(
         f"{source}: neither a data set that is known ({', '.join(DATA_SETS)}), a folder with {RANGES}, "
         f"{SCANS} or {INERTIAL}, a CARMEN log ({', '.join(_CARMEN)}) nor a ROS bag ({', '.join(_BAGS)})"

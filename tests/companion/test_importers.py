@@ -300,6 +300,13 @@ def test_what_cannot_be_read_is_said(tmp_path: Path, name: str, text: str, said:
         import_log(tmp_path / name, tmp_path / "out.mcap", SITE)
 
 
+def test_a_site_is_not_asked_for_before_the_recording_is_one(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=r"cannot read .*gone\.log: No such file or directory"):
+        import_log(tmp_path / "gone.log", tmp_path / "out.mcap")
+    with pytest.raises(UserError, match="neither a data set that is known"):
+        import_log(tmp_path, tmp_path / "out.mcap")
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [
