@@ -10,7 +10,7 @@ from rich.table import Table
 
 from companion.errors import UserError
 from companion.shipped_files import named_file
-from companion.terminal import LogPath, message_console, result_console
+from companion.terminal import LogPath, message_console, reading, result_console
 
 if TYPE_CHECKING:
     from companion.calibration.bearings import BearingFit
@@ -78,9 +78,11 @@ def ranges(
     from companion.log import Log
 
     config = load_config(site)
-    recording = read_recording(
-        Log(log), config, until, with_odometry=against == "lidar", every_tag=against == "truth"
-    )
+    opened = Log(log)
+    with reading(opened):
+        recording = read_recording(
+            opened, config, until, with_odometry=against == "lidar", every_tag=against == "truth"
+        )
     frames = recording.range_frames
     seen = {frame.tag_id for frame in frames}
     of_tags: dict[int, TagBias] = {}
@@ -155,7 +157,10 @@ def mounting(log: LogPath, site: Site, until: Until = None, figures: Json = None
     from companion.log import Log
 
     config = load_config(named_file(site, "sites"))
-    found = mounting_on_drive(read_recording(Log(log), config, until, with_odometry=True), config)
+    opened = Log(log)
+    with reading(opened):
+        recording = read_recording(opened, config, until, with_odometry=True)
+    found = mounting_on_drive(recording, config)
     table = Table(title=f"{config.site.name}: UWB tag against LiDAR", title_justify="left")
     for heading in ("", "site", "found", "sigma", "unit"):
         table.add_column(heading, justify="right" if heading else "left")

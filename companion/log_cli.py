@@ -7,7 +7,7 @@ import typer
 
 from companion.errors import UserError
 from companion.shipped_files import named_file
-from companion.terminal import LogPath, Seed, Sets, message_console, progress, result_console
+from companion.terminal import LogPath, Seed, Sets, message_console, progress, reading, result_console
 
 
 def make_map(
@@ -84,7 +84,9 @@ def edit(
 
     opened = Log(log)
     config = config_of(opened, [])
-    edit_log(opened, config, [parse_fault(text, config) for text in fault], seed or 0, path)
+    faults = [parse_fault(text, config) for text in fault]
+    with reading(opened):
+        edit_log(opened, config, faults, seed or 0, path)
     result_console().print(f"{path}  replay it with: companion replay {path}", soft_wrap=True)
 
 
@@ -129,5 +131,7 @@ def export(
     from companion.replay import config_of
 
     opened = Log(log)
-    for path in write_folder(opened, config_of(opened, []), folder):
+    with reading(opened):
+        written = write_folder(opened, config_of(opened, []), folder)
+    for path in written:
         result_console().print(str(path), soft_wrap=True)

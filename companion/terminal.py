@@ -1,8 +1,11 @@
 """What the commands share: results go to stdout, progress and messages to stderr; options of several."""
 
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from inspect import cleandoc
 from pathlib import Path
+from threading import Event, Thread
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -20,6 +23,7 @@ from companion.errors import UserError
 from companion.run_folder import log_in
 
 if TYPE_CHECKING:
+    from companion.log import Log
     from companion.view.viewer import Shown
 
 LogPath = Annotated[
@@ -79,6 +83,26 @@ def progress(console: Console, *, counts: bool = False) -> Progress:
         transient=True,
         disable=not console.is_terminal,
     )
+
+
+@contextmanager
+def reading(log: "Log") -> Iterator[None]:
+    """A bar that shows how much of a log has been read, while something in here reads it."""
+    done = Event()
+    with progress(message_console()) as shown:
+        bar = shown.add_task(log.path.name, total=1.0)
+
+        def follow() -> None:
+            while not done.wait(0.1):
+                shown.update(bar, completed=log.share_read)
+
+        follower = Thread(target=follow, daemon=True)
+        follower.start()
+        try:
+            yield
+        finally:
+            done.set()
+            follower.join()
 
 
 def flow_help(app: typer.Typer) -> None:

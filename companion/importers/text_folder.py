@@ -6,20 +6,27 @@ accel x, y, z [m/s^2]. `truth.tum`: TUM poses of the body. A file that is not th
 """
 
 from collections.abc import Iterable, Iterator
+from contextlib import ExitStack
 from itertools import groupby
 from pathlib import Path
+from typing import TextIO
 
 import numpy as np
 
 from companion.config import Config
 from companion.errors import UserError
 from companion.importers.recording import Recording
-from companion.importers.tables import numbers, read_tum, rows, write_lines, write_tum
+from companion.importers.tables import numbers, read_tum, rows, write_tum
 from companion.log import Direction, RawChunk, Truth
 from companion.pipeline import make_sensors
-from estimators.messages import ImuSample, RangeFrame, Scan
+from estimators.messages import ImuSample, Measurement, RangeFrame, Scan
 
 RANGES, SCANS, INERTIAL, TRUTH = "ranges.csv", "scans.csv", "imu.csv", "truth.tum"
+_HEADINGS = {
+    RANGES: "stamp_ns,tag,anchor,range_m,rx_power_dbm,fp_power_dbm\n",
+    SCANS: "stamp_ns,angle_deg,range_m,time_s,quality\n",
+    INERTIAL: "stamp_ns,gyro_x,gyro_y,gyro_z,accel_x,accel_y,accel_z\n",
+}
 
 
 def read_folder(folder: Path) -> Recording:
@@ -63,33 +70,41 @@ def write_folder(records: Iterable[RawChunk | Truth], config: Config, folder: Pa
     """
     sensors = make_sensors(config)
     truths: list[Truth] = []
-    lines = {
-        RANGES: ["stamp_ns,tag,anchor,range_m,rx_power_dbm,fp_power_dbm\n"],
-        SCANS: ["stamp_ns,angle_deg,range_m,time_s,quality\n"],
-        INERTIAL: ["stamp_ns,gyro_x,gyro_y,gyro_z,accel_x,accel_y,accel_z\n"],
-    }
-    for record in records:
-        if isinstance(record, Truth):
-            truths.append(record)
-        elif record.source in sensors and record.direction is Direction.IN:
-            for m in sensors[record.source].feed(record.data, record.stamp_ns):
-                if isinstance(m, RangeFrame):
-                    columns = (m.anchor_ids, m.ranges, m.rx_power, m.fp_power)
-                    lines[RANGES] += _lines(f"{m.stamp_ns},{m.tag_id}", *columns)
-                elif isinstance(m, Scan):
-                    columns = (np.rad2deg(m.angles), m.ranges, m.beam_times, m.quality)
-                    lines[SCANS] += _lines(f"{m.stamp_ns}", *columns)
-                elif isinstance(m, ImuSample):
-                    lines[INERTIAL] += _lines(f"{m.stamp_ns}", *m.gyro[:, None], *m.accel[:, None])
-    written = []
-    for name, text in lines.items():
-        if len(text) > 1:
-            write_lines(folder / name, text)
-            written.append(folder / name)
+    files: dict[str, TextIO] = {}
+    try:
+        with ExitStack() as opened:
+            for record in records:
+                if isinstance(record, Truth):
+                    truths.append(record)
+                elif record.source in sensors and record.direction is Direction.IN:
+                    for m in sensors[record.source].feed(record.data, record.stamp_ns):
+                        name, lines = _text_of(m)
+                        if not name:
+                            continue
+                        if name not in files:
+                            folder.mkdir(parents=True, exist_ok=True)
+                            files[name] = opened.enter_context((folder / name).open("w", encoding="utf-8"))
+                            files[name].write(_HEADINGS[name])
+                        files[name].writelines(lines)
+    except OSError as error:
+        raise UserError(f"cannot write {error.filename or folder}: {error.strerror}") from error
+    written = [folder / name for name in _HEADINGS if name in files]
     if truths:
         write_tum(folder / TRUTH, truths)
         written.append(folder / TRUTH)
     return written
+
+
+def _text_of(measurement: Measurement) -> tuple[str, Iterator[str]]:
+    """File for a measurement, empty for what has none, and its lines there."""
+    match measurement:
+        case RangeFrame(stamp_ns, tag_id, anchor_ids, ranges, rx_power, fp_power):
+            return RANGES, _lines(f"{stamp_ns},{tag_id}", anchor_ids, ranges, rx_power, fp_power)
+        case Scan(stamp_ns, angles, ranges, beam_times, quality):
+            return SCANS, _lines(f"{stamp_ns}", np.rad2deg(angles), ranges, beam_times, quality)
+        case ImuSample(stamp_ns, gyro, accel):
+            return INERTIAL, _lines(f"{stamp_ns}", *gyro[:, None], *accel[:, None])
+    return "", iter(())
 
 
 def _lines(head: str, *columns: np.ndarray[tuple[int, ...], np.dtype[np.generic]]) -> Iterator[str]:
