@@ -35,7 +35,7 @@ class AnchorTrust:
 
         self._kernels = anchor_trust
         self.state = (
-            np.zeros((anchors, 3)),
+            np.zeros((anchors, 4)),
             np.zeros((anchors, 3), dtype=np.int64),
             np.zeros(3, dtype=np.int64),
         )
@@ -44,6 +44,10 @@ class AnchorTrust:
     def reset(self) -> None:
         """Believe every anchor."""
         self._kernels.believe_all(*self.state)
+
+    def doubt(self, stamp_ns: int) -> float:
+        """How far the pose may be off because an anchor contradicts it [m]."""
+        return self._kernels.doubt(*self.state[:2], stamp_ns)
 
     def note_odometry(self, stamp_ns: int) -> None:
         """Odometry came."""

@@ -41,6 +41,9 @@ class FixTaker(KeyframeTracker):
         self._gate.see(measurement, self.pose_at)
         return report
 
+    def _doubt(self, stamp_ns: int) -> float:
+        return self._gate.doubt(stamp_ns)
+
     @abstractmethod
     def _update_ranges(self, frame: RangeFrame) -> Report:
         """Judge the ranges of this instant, and take those that are believed."""

@@ -175,6 +175,10 @@ class RangeGate:
         """Greatest NIS that passes."""
         return self._limit
 
+    def doubt(self, stamp_ns: int) -> float:
+        """How far a pose that these ranges correct may be off because they contradict each other [m]."""
+        return self._trust.doubt(stamp_ns)
+
     def see(self, measurement: Measurement, pose_at: Callable[[int], PoseEstimate | None]) -> None:
         """Look at what is no range; `pose_at` is that of the filter, which has taken the measurement."""
         if isinstance(measurement, PoseIncrement):

@@ -114,6 +114,9 @@ class GraphSmoother(KeyframeTracker):
         mean, cov = self._predicted(stamp_ns)
         return self._estimate(stamp_ns, mean[STATE], cov[STATE, STATE], self._heading_known)
 
+    def _doubt(self, stamp_ns: int) -> float:
+        return self._gate.doubt(stamp_ns)
+
     def sketch(self) -> Sketch:
         """The poses of the window, and which of them are keyframes."""
         window = self._window

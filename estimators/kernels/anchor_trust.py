@@ -1,6 +1,6 @@
 """Averaged residuals of anchors, and whether they contradict those of the others, see `AnchorTrust`."""
 
-from math import sqrt
+from math import exp, sqrt
 
 import numpy as np
 
@@ -24,9 +24,15 @@ PROBATION = 10.0
 """It must agree for so long [s] before it is believed again, twice as long at every further time."""
 RECENT = 2.0
 """What was last heard longer ago [s], an anchor or odometry, is no witness."""
+EXPLAINED = 2.0
+"""Sigmas of a mean residual that noise explains; what is beyond them is the pose's or the anchor's error."""
+FOLLOWED = 1.5
+"""How far the pose may be off by such an error: it has followed the anchor, the residual is what remains."""
+FADES = 10.0
+"""Time constant of that doubt [s]: a pose that has followed a wrong anchor whole no longer contradicts it."""
 
-COUNT, MEAN, BY_POSE = 0, 1, 2
-"""Of an anchor's residuals: how many, mean [m], mean variance by the pose [m^2]."""
+COUNT, MEAN, BY_POSE, DOUBT_LEFT = 0, 1, 2, 3
+"""Of an anchor's residuals: how many, mean [m], mean variance by the pose [m^2], doubt [m]."""
 HEARD_NS, AGREES_SINCE_NS, TIMES = 0, 1, 2
 """When an anchor was last heard, since when it has agreed while it is left out, how often it was left out."""
 ODOMETRY_NS, AGREE_SINCE_NS, HAVE_AGREED = 0, 1, 2
@@ -48,6 +54,29 @@ def _is_recent(stamp_ns: int, now_ns: int) -> bool:
     return stamp_ns != NEVER and (now_ns - stamp_ns) * 1e-9 <= RECENT
 
 
+@inlined
+def _faded(since_ns: int, now_ns: int) -> float:
+    """What is left of a doubt."""
+    return exp((since_ns - now_ns) * 1e-9 / FADES) if since_ns != NEVER else 0.0
+
+
+@compiled(f"float64({MATRIX}, int64[:, ::1], int64)")
+def doubt(residuals: FloatArray, heard: IntArray, stamp_ns: int) -> float:
+    """How far the pose may be off because an anchor contradicts it, left out or not, [m].
+
+    Whether the pose or the anchor is wrong is not known. So nobody can say that the pose is right.
+
+    Args:
+        residuals: as of `note`.
+        heard: likewise.
+        stamp_ns: now.
+    """
+    most = 0.0
+    for i in range(len(residuals)):
+        most = max(most, residuals[i, DOUBT_LEFT] * _faded(heard[i, HEARD_NS], stamp_ns))
+    return most
+
+
 @compiled(f"boolean({MATRIX}, int64[:, ::1], {INDICES}, int64, int64, float64, float64, float64)")
 def note(
     residuals: FloatArray,
@@ -62,7 +91,7 @@ def note(
     """Take a range that nothing seems to block.
 
     Args:
-        residuals: (A, 3) a row of `COUNT`, `MEAN`, `BY_POSE` of each anchor.
+        residuals: (A, 4) a row of `COUNT`, `MEAN`, `BY_POSE`, `DOUBT_LEFT` of each anchor.
         heard: (A, 3) a row of `HEARD_NS`, `AGREES_SINCE_NS`, `TIMES` of each anchor.
         common: (3,) `ODOMETRY_NS`, `AGREE_SINCE_NS`, `HAVE_AGREED`.
         anchor: number of the anchor.
@@ -74,9 +103,6 @@ def note(
     Returns:
         Whether the anchor is believed.
     """
-    most = (len(residuals) - 2) // 2
-    if most <= 0:
-        return True
     if not _is_recent(common[ODOMETRY_NS], stamp_ns):
         believe_all(residuals, heard, common)
         return True
@@ -84,6 +110,7 @@ def note(
         common[AGREE_SINCE_NS] = stamp_ns
     bound = CLIPPED * sqrt(variance)
     own, at = residuals[anchor], heard[anchor]
+    own[DOUBT_LEFT] *= _faded(at[HEARD_NS], stamp_ns)
     at[HEARD_NS] = stamp_ns
     own[COUNT] += 1.0
     share = 1.0 / min(own[COUNT], SPAN)
@@ -91,7 +118,9 @@ def note(
     own[BY_POSE] += share * (max(variance - sigma**2, 0.0) - own[BY_POSE])
     if own[COUNT] < LEAST:
         return bool(at[AGREES_SINCE_NS] == NEVER)
-    witnesses, count, left_out = np.empty(len(residuals)), 0, 0
+    noise = sqrt(sigma**2 / (2.0 * SPAN - 1.0) + own[BY_POSE])
+    own[DOUBT_LEFT] = max(own[DOUBT_LEFT], FOLLOWED * (abs(own[MEAN]) - EXPLAINED * noise))
+    witnesses, count, left_out, most = np.empty(len(residuals)), 0, 0, (len(residuals) - 2) // 2
     for i in range(len(residuals)):
         if heard[i, AGREES_SINCE_NS] != NEVER:
             left_out += 1

@@ -122,6 +122,7 @@ class KeyframeTracker(ABC):
             heading_known: False makes the variance of yaw infinite.
         """
         planar = cov[:3, :3].copy()
+        planar.flat[:5:4] += self._doubt(stamp_ns) ** 2
         if not heading_known:
             planar[2, :2] = planar[:2, 2] = 0.0
             planar[2, 2] = np.inf
@@ -137,6 +138,10 @@ class KeyframeTracker(ABC):
             velocity,
             velocity_cov,
         )
+
+    def _doubt(self, stamp_ns: int) -> float:  # noqa: ARG002
+        """How far the position may be off besides what the state's covariance says [m]."""
+        return 0.0
 
     def _reaches(self, stamp_ns: int) -> bool:
         """Whether anything is said of the pose at a time."""

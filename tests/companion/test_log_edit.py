@@ -17,6 +17,7 @@ from companion.log_edit.faults import KINDS, library, parse_fault
 from companion.log_edit.ranges import Changed, change_ranges
 from companion.raw_scans import ScanEncoder
 from companion.replay import config_of, replay
+from companion.shipped_files import params_dir
 from drivers.linktrack import LinkTrack, measurements
 from drivers.linktrack_frames import encode
 from drivers.linktrack_types import (
@@ -368,6 +369,19 @@ def test_evaluate_puts_the_fault_into_every_trial(short_log: Path) -> None:
 def test_a_scenario_without_bytes_takes_no_fault(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="has no bytes to put a fault into"):
         evaluate_scenario(write_scenario(tmp_path, more=FEW), 1, choices=["ekf"], faults=["spike"])
+
+
+@pytest.mark.parametrize("shift", ["x=0.5", "x=0.2"])
+def test_a_pose_that_followed_a_moved_anchor_does_not_claim_to_be_sure(shift: str) -> None:
+    # Furniture hides two of the others while the robot is near it, so that it cannot be told at once.
+    scenario = params_dir() / "scenarios" / "square_room.toml"
+    names = ["ekf", "pf_ibas_graph"]
+    found = evaluate_scenario(scenario, 2, choices=names, faults=[f"moved:anchor=3,{shift},at=15"])
+    for name in names:
+        figures = found.estimators[name]
+        assert figures is not None
+        assert figures.integrity is not None
+        assert figures.integrity < 0.03
 
 
 def test_the_command_says_what_is_wrong_in_one_line(short_log: Path, command: Command) -> None:

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from estimators.anchor_trust import AnchorTrust
-from estimators.kernels.anchor_trust import ALLOWED, PROBATION, note
+from estimators.kernels.anchor_trust import ALLOWED, FADES, PROBATION, note
 
 SIGMA = 0.1
 STEP_NS = 40_000_000
@@ -25,9 +25,10 @@ def hear(
     means: dict[int, float],
     noise: float = SIGMA,
     odometry: bool = True,
+    seed: int = 7,
 ) -> list[set[int]]:
     """Anchors heard at 25 Hz whose residuals err by so much; who was left out after each frame."""
-    rng = np.random.default_rng(7)
+    rng = np.random.default_rng(seed)
     left_out = []
     for stamp_ns in range(round(begin * 1e9), round(end * 1e9), STEP_NS):
         if odometry:
@@ -106,11 +107,37 @@ def test_an_anchor_that_agrees_again_is_believed_after_its_probation_which_doubl
         now += 0.1 * probation + 5.0
 
 
+def test_noise_casts_hardly_any_doubt_on_the_pose() -> None:
+    trust, doubts = AnchorTrust(4), []
+    for second in range(600):
+        hear(trust, second, second + 1.0, agreeing(), seed=second)
+        doubts.append(trust.doubt((second + 1) * 10**9))
+    assert np.median(doubts) < 0.05 * SIGMA
+    assert max(doubts) < 0.3 * SIGMA
+
+
+@pytest.mark.parametrize("shift", [-0.2, 0.2])
+def test_an_anchor_that_contradicts_casts_doubt_on_the_pose_which_outlasts_it(shift: float) -> None:
+    trust = AnchorTrust(4)
+    hear(trust, 0.0, 15.0, agreeing())
+    hear(trust, 15.0, 18.0, agreeing(a2=shift))
+    doubt = trust.doubt(18 * 10**9)
+    assert 0.5 * abs(shift) < doubt < 1.5 * abs(shift)
+    # Whether it agrees since the pose has followed it, or is not heard at all, the pose owes it as much.
+    for means in (agreeing(), {}):
+        later = AnchorTrust(4)
+        for mine, theirs in zip(later.state, trust.state, strict=True):
+            mine[:] = theirs
+        hear(later, 18.0, 28.0, means)
+        assert later.doubt(28 * 10**9) == pytest.approx(doubt * np.exp(-10.0 / FADES), rel=0.3)
+
+
 def test_a_reset_believes_every_anchor() -> None:
     trust = AnchorTrust(4)
     hear(trust, 0.0, 15.0, agreeing())
     assert hear(trust, 15.0, 18.0, agreeing(a0=0.5))[-1] == {0}
     trust.reset()
+    assert trust.doubt(18 * 10**9) == 0.0
     assert not any(hear(trust, 18.0, 21.0, agreeing(a0=0.5)))
 
 
